@@ -156,6 +156,17 @@ def grouped_sums(values: Floats, index: Ints, count: int) -> Floats:
     return np.stack([np.bincount(index, column, count) for column in values.T], axis=1).astype(np.float64)
 
 
+def grouped_visits(stamps: Floats, index: Ints, away: float) -> Ints:
+    """Return the visit (R,) of each ray: rays of one object without a gap of more than `away` seconds between them.
+
+    Visits of one object have consecutive numbers, and no visit has rays of two. stamps: (R,) s. index: (R,) the object."""
+    order = np.lexsort((stamps, index))
+    begins = np.append(False, (np.diff(index[order]) != 0) | (np.diff(stamps[order]) > away))[: len(index)]
+    visit = np.zeros(len(index), dtype=np.int64)
+    visit[order] = np.cumsum(begins)
+    return visit
+
+
 def order_by_group(index: Ints, count: int) -> Ints:
     """Return the order (R,) that brings the members of each group together. Members of one group keep their order.
 

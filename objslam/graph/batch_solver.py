@@ -273,7 +273,13 @@ def solve_joint(
         noise=None if errors is None else errors.noise,
         correlated=correlated if tags is None else tags.of_objects(correlated),
         log_evidence=log_evidence(
-            measured, association, used, np.linalg.norm(seen - origins, axis=1), solved, optimum.cost_after
+            measured,
+            association,
+            used,
+            np.linalg.norm(seen - origins, axis=1),
+            solved,
+            optimum.cost_after,
+            errors is not None and "ranges" in errors.unknown_noise,
         ),
         uncalibrated=failed,
     )

@@ -11,6 +11,7 @@ from scipy.stats import multivariate_normal
 from objslam.core.statistics import CAUCHY_K
 from objslam.core.types import Association
 from objslam.graph.assembly import Measurements
+from objslam.graph.factors.range import share_bias
 from objslam.graph.posterior.evidence import log_evidence, shared_bias_density
 from objslam.graph.posterior.marginals import SolvedGraph
 from objslam.simulation import DepthNoise
@@ -97,3 +98,31 @@ def test_one_wrong_error_does_not_move_the_bias_of_a_group():
     squares = squares.sum(axis=0) + shared**2 / bias[0] + np.log(2 * np.pi * variance).sum() + np.log(2 * np.pi * bias[0])
     expected = np.log(np.trapezoid(np.exp(-squares / 2 + squares.min() / 2), shared)) - squares.min() / 2
     assert shared_bias_density(off, variance, bias, group, 1) == pytest.approx(expected, abs=0.5)
+
+
+def test_ranges_that_end_before_a_thing_in_one_visit_make_no_second_thing_of_it():
+    """They end 0.4 m before it in the first of two visits. A second thing at this place would agree with them exactly. If
+    each range counts for itself, the second thing explains more, because it needs less noise."""
+    drive = make_drive(2, "mode=joint", objects=8, classes=8, frames=80, false=0.0, depth=DepthNoise(), **ODOMETRY_ALONE)
+    estimate, every, one = drive.joint(), np.ones(len(drive.rays), dtype=bool), drive.association
+    early = np.array_split(np.flatnonzero(one.object == 0), 2)[0]
+    away = np.arange(len(drive.keyframes)) > drive.rays.keyframe[early[-1]]
+    drive = replace(drive, keyframes=replace(drive.keyframes, stamps=drive.keyframes.stamps + 10.0 * away))
+    shorter, owner = drive.rays.range.copy(), one.object.copy()
+    shorter[early] -= 0.4
+    owner[early] = one.count
+    two = Association(owner, np.append(one.label, one.label[0]))
+    poses = estimate.map_T_base @ drive.keyframes.base_T_camera
+    distance = np.linalg.norm(estimate.positions[one.object] - drive.rays.in_map(poses)[0], axis=1)
+
+    def evidence(ranges, association, ranges_open):
+        rays = share_bias(replace(drive.rays, range=ranges), association)
+        measured = Measurements.of(drive.keyframes, rays, drive.settings)
+        positions = np.vstack([estimate.positions, estimate.positions[:1]])[: association.count]
+        graph, values = measured.whole(association.object, every, poses, positions, "gnc")
+        args = every, distance, SolvedGraph(graph, values), graph.error(values)
+        return log_evidence(measured, association, *args, ranges_open)
+
+    gain = {way: evidence(shorter, one, way) - evidence(drive.rays.range, two, way) for way in (False, True)}
+    assert gain[True] > 5
+    assert gain[False] < -5

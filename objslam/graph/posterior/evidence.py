@@ -4,12 +4,15 @@ A map can explain more rays, or explain them more closely, if it bends the path.
 that estimates the noise finds more noise in the odometry. The evidence counts both: each measurement has a density, which is
 lower if its noise is larger. It is integrated over poses and landmarks. So each landmark has a cost, which is larger for a
 better determined landmark (Occam factor; MacKay, Information Theory, 2003, chapter 28).
+
+The ranges of one visit to a thing err alike: they end on the same part of it, or on what stands before it. If each range
+counted for itself, a map with the thing at several places, one for each visit, would be the better one.
 """
 
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.statistics import CAUCHY_K
+from objslam.core.statistics import CAUCHY_K, NORMAL_MEDIAN, grouped_median, grouped_visits
 from objslam.core.types import Association
 from objslam.graph.assembly import Measurements
 from objslam.graph.factors.bearing import EQ1_SIGMA
@@ -22,9 +25,25 @@ rays counts more, and their noise less."""
 _ITERATIONS = 10
 """How often the bias that errors share is computed with new robust weights. Five are usual. More are slower."""
 
+_AWAY = 3.0
+"""The shortest time (s) without a box of a thing between two visits. With a longer time, more ranges share an error."""
+
+_FEWEST = 3
+"""The fewest ranges of a visit that show the noise of single ranges. In a visit of two, one of them is the median."""
+
+_PRIOR_VISITS = 2
+"""The bias in the settings weighs as much as this number of visits in the bias of each label. With a larger number, labels
+differ less."""
+
 
 def log_evidence(
-    measured: Measurements, association: Association, used: Bools, distance: Floats, solved: Solved, cost: float
+    measured: Measurements,
+    association: Association,
+    used: Bools,
+    distance: Floats,
+    solved: Solved,
+    cost: float,
+    ranges_open: bool = False,
 ) -> float:
     """Return the log evidence for an association, up to a constant that all associations of the same rays share.
 
@@ -35,6 +54,8 @@ def log_evidence(
         distance: (n,) m, from the origin of each used ray to its landmark.
         solved: the graph at its solution, with its Gaussian noise.
         cost: the cost of the solution, which is half the sum of the squared residuals, with the robust losses.
+        ranges_open: whether the noise of ranges is estimated. Then their density has the noise that the association shows,
+            and each visit has a bias of its own. Otherwise, the ranges of a landmark share the bias of the settings.
 
     Returns:
         The log evidence, -inf if the linear system is indeterminate.
@@ -45,7 +66,7 @@ def log_evidence(
     sigma = rays.sigma[used] if settings.joint.factor == "bearing" else EQ1_SIGMA / distance
     total = -cost - float(np.log(2 * np.pi * sigma**2).sum()) - np.log(_VIEW) * int((~used).sum())
     if np.isfinite(rays.range).any():
-        total += _of_ranges(measured, association, used, distance)
+        total += _of_ranges(measured, association, used, distance, ranges_open)
     if measured.motions is not None:
         _, covariance = measured.odometry()
         total -= float(np.linalg.slogdet(covariance[measured.keyframes.measured])[1].sum()) / 2
@@ -53,12 +74,12 @@ def log_evidence(
     return float(total - unknowns * np.log(settings.joint.prior_sigma) - inverse.log_determinant / 2)
 
 
-def _of_ranges(measured: Measurements, association: Association, used: Bools, distance: Floats) -> float:
+def _of_ranges(measured: Measurements, association: Association, used: Bools, distance: Floats, noise_open: bool) -> float:
     """Return the log density of all ranges, plus their cost in the graph. used, distance: as in `log_evidence`.
 
-    The ranges of a landmark share a bias. In the graph, each range has more noise instead. So the cost in the graph is taken
-    out of the evidence, and the log density with the bias takes its place. A stray range has the distribution of all ranges
-    of the log.
+    The ranges of a visit, or of a landmark, share a bias. In the graph, each range has more noise instead. So the cost in
+    the graph is taken out of the evidence, and the log density with the bias takes its place. A stray range has the
+    distribution of all ranges of the log. noise_open: `ranges_open` of `log_evidence`.
     """
     rays, ranged = measured.rays, np.isfinite(measured.rays.range)
     spread = float(np.log(12 * np.var(rays.range[ranged]) + 2 * np.pi * np.median(rays.range_sigma[ranged]) ** 2)) / 2
@@ -67,9 +88,38 @@ def _of_ranges(measured: Measurements, association: Association, used: Bools, di
     some, off = rays.take(np.flatnonzero(used & ranged)), (rays.range[used] - distance)[here]
     owner = association.object[used & ranged]
     variance = some.range_sigma**2 - number[owner] * some.range_bias**2  # Without the noise for the bias.
-    density = shared_bias_density(off, variance, some.range_bias**2, owner, association.count)
+    bias, group = some.range_bias**2, owner
+    if noise_open:
+        group = grouped_visits(measured.keyframes.stamps[some.keyframe], owner, _AWAY)
+        label = association.label[owner]
+        variance, bias = _noise_of_visits(off, variance, bias, group, label, measured.settings.noise.prior)
+    density = shared_bias_density(off, variance, bias, group, int(group.max(initial=-1)) + 1)
     in_graph = CAUCHY_K**2 / 2 * float(np.log1p((off / some.range_sigma / CAUCHY_K) ** 2).sum())
     return density + in_graph - spread * (int(ranged.sum()) - len(off))
+
+
+def _noise_of_visits(
+    off: Floats, variance: Floats, bias: Floats, visit: Ints, label: Ints, prior: float
+) -> tuple[Floats, Floats]:
+    """Return the variance (n,) m^2 of each range without the bias, and that of the bias of its visit, as the errors show it.
+
+    Each label has a factor on its variance, and one bias, because a camera sees through the things of some labels, or past
+    them. off, variance, bias: as in `shared_bias_density`, with the noise of the solve. label: (n,). prior: the weight of
+    this noise, as a number of ranges.
+    """
+    visits, labels = int(visit.max(initial=-1)) + 1, int(label.max(initial=-1)) + 1
+    number, middle = np.bincount(visit, minlength=visits), grouped_median(off, visit, visits)
+    many = number[visit] >= _FEWEST
+    deviation = np.abs(off - middle[visit])[many] / np.sqrt(variance[many])
+    factor = np.nan_to_num(grouped_median(deviation, label[many], labels)) / NORMAL_MEDIAN
+    ranges = np.bincount(label[many], minlength=labels)
+    variance = variance * ((prior + ranges * factor**2) / (prior + ranges))[label]
+    first = np.unique(visit, return_index=True)[1]  # The ranges of a visit have one label.
+    of, squares = label[first], np.maximum(middle**2 - variance[first] / number, 0.0)
+    each = np.bincount(of, minlength=labels)
+    nominal = np.bincount(label, bias, labels) / np.maximum(np.bincount(label, minlength=labels), 1)
+    shared = (_PRIOR_VISITS * nominal + np.bincount(of, squares, labels)) / (_PRIOR_VISITS + each)
+    return variance, shared[label]
 
 
 def shared_bias_density(off: Floats, variance: Floats, bias: Floats, group: Ints, count: int) -> float:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from objslam.core.geometry import angles_off, lengths
+from objslam.core.statistics import grouped_visits
 from objslam.core.types import Association
 from objslam.errors import SolveError
 from objslam.frontend.tracks import FEWEST, tracks_of_rays
@@ -196,7 +197,8 @@ def _moving(
         fits = squares <= _SCATTER**2 * usual * number
     # An object without long tracks, such as one whose rays are all rejected, would take up rays of the dropped objects.
     shown = np.flatnonzero(long & (owner >= 0))
-    visits = _visits(keyframes.stamps[rays.keyframe[shown]], owner[shown], association.count)
+    visit = grouped_visits(keyframes.stamps[rays.keyframe[shown]], owner[shown], _AWAY)
+    visits = np.bincount(owner[shown][np.unique(visit, return_index=True)[1]], minlength=association.count)
     of_moving = (moves | wander)[label] & ((pure < _PURE) | (visits == 0))
     return np.asarray(of_moving | (wander[label] & ((visits < _VISITS) | ~fits)))
 
@@ -245,13 +247,3 @@ def _wander(
     explained = np.bincount(track, owner[held] >= 0, count) >= _EXPLAINED * length
     follow = (squares > _APART**2 * usual * length) & ~explained
     return np.asarray(np.bincount(label, follow * length, labels) > _FOLLOWS * np.bincount(label, length, labels))
-
-
-def _visits(stamps: Floats, owner: Ints, count: int) -> Ints:
-    """Return how many visits (N,) each object has: groups of rays without a gap of `_AWAY` between them.
-
-    stamps: (R,) s. owner: (R,) the object of each ray."""
-    order = np.lexsort((stamps, owner))
-    of, at = owner[order], stamps[order]
-    begins = np.append(True, (np.diff(of) != 0) | (np.diff(at) > _AWAY))[: len(of)]
-    return np.bincount(of[begins], minlength=count)
