@@ -20,10 +20,7 @@ from objslam.frontend.boxes.robot_parts import without_robot_parts
 from objslam.frontend.boxes.second_labels import without_second_labels
 from objslam.frontend.keyframes import build_keyframes, with_given_stamps
 from objslam.frontend.known_errors import shared_errors, take_out_expected, take_out_known
-from objslam.frontend.localization.continued_localization import (
-    continued_by_odometry,
-    share_on_continuation,
-)
+from objslam.frontend.localization.continued_localization import continued_by_odometry, share_on_continuation
 from objslam.frontend.localization.odometry_clock import at_one_clock
 from objslam.frontend.turning_clocks import in_order_of_clocks
 from objslam.graph.least_squares.libraries import load_libraries
@@ -50,6 +47,7 @@ from objslam.mapping.chosen_poses import (
 from objslam.mapping.contradicting_ranges import with_contradicting_ranges
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
+from objslam.mapping.doubts.find import mostly_doubtful
 from objslam.mapping.fixed.far_sides import with_far_sides
 from objslam.mapping.fixed.lasting_errors import check_lasting_noise, with_lasting_errors
 from objslam.mapping.fixed.map_at_poses import MapAtPoses
@@ -79,14 +77,14 @@ def run(
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
     With mode `auto`, a log whose localisation errs for seconds (`check_lasting_noise`) is solved once more in joint mode, if
-    it has odometry too, or if the settings leave the noise of the localisation open. A log with odometry is solved once
-    more, too, if its localisation errs by more than the settings say (`check_pose_noise`). A log that has odometry, and
-    localised poses at which no object has a place, is solved once more, too. So is a log whose map is not good, if the
+    it has odometry too, or if the settings leave the noise of the localisation open. So is a log with most objects doubtful
+    at the localised poses. A log with odometry is solved once more, too, in three cases. Its localisation errs by more than
+    the settings say (`check_pose_noise`). No object has a place at the localised poses. Or its map is not good, and the
     odometry shows that the localisation errs for seconds (`odometry_contradicts`). If jumps of the localisation spoil the
-    map, a log with odometry is mapped by it alone. known: the map of another day. If the
-    drive is found in it, the result is in its frame, and its objects count as priors. LogError if the log lacks the chosen
-    poses, if its stamps have different units, or if no frame lies on the path. SolveError if no box gives a usable ray.
-    ConfigError if calibration.file is wrong or does not fit the log.
+    map, a log with odometry is mapped by it alone. known: the map of another day. If the drive is found in it, the result is
+    in its frame, and its objects count as priors. LogError if the log lacks the chosen poses, if its stamps have different
+    units, or if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong
+    or does not fit the log.
     """
     before = ledger.copy()
     try:
@@ -109,7 +107,7 @@ def run(
             ledger.restore(at_poses)
             return result
     # Without odometry, the second solve takes the noise of the localisation from the rays.
-    untold = found.lasting is not None and settings.finds_localization_noise
+    untold = settings.finds_localization_noise and (found.lasting is not None or mostly_doubtful(result.summary))
     if settings.mode != "auto" or not wrong or (chosen_poses(log, settings).odometry is None and not untold):
         return result
     at_poses = ledger.copy()
@@ -313,12 +311,14 @@ def _run(
         why = "the localisation errs by more than its settings say"
     if settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings and not objects.resolved():
         why = "no object has a place at the localised poses"
-    unclear = result.summary["assessment"]["level"] != "good"
-    testable = open_mode and settings.mode == "fixed" and not diagnosis.certain  # A joint solve may refute what boxes show.
-    if not why and settings.checks.use and testable and unclear and odometry_contradicts(given, settings):
+    # A joint solve may refute what boxes show.
+    testable = open_mode and settings.mode == "fixed" and settings.checks.use and not diagnosis.certain
+    doubtful, unclear = mostly_doubtful(result.summary), result.summary["assessment"]["level"] != "good"
+    if not why and testable and unclear and odometry_contradicts(given, settings):
         why = "the odometry shows that the localisation errs for seconds"
+    why = why or ("many objects at the localised poses are doubtful" if testable and doubtful else "")
     found = solution.rays, solution.whole or solution.association
-    return result, why, MapAtPoses(None if late is None else lasting, *found, trusted)
+    return result, why, MapAtPoses(None if late is None else lasting, *found, trusted and not doubtful)
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:
