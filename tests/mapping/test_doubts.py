@@ -85,6 +85,25 @@ def test_one_object_taken_as_two_may_be_one():
     assert after["reasons"][1:] == before["reasons"][1:]
 
 
+def halves(result: RunResult, objects: int) -> RunResult:
+    """The result whose first objects are two objects each: one of their earlier boxes, and one of their later boxes."""
+    mine = result.association.object
+    late = np.zeros(len(mine), dtype=bool)
+    for j in range(objects):
+        late[np.array_split(np.flatnonzero(mine == j), 2)[1]] = True
+    return reassociated(result, np.where(late, mine + len(result.map), mine))
+
+
+def test_a_map_of_many_doubles_is_bad_and_names_the_poses():
+    result = mapped(simulate(preset("rooms", false=0.0), 1))
+    assert result.summary["doubtful_objects"] == 0
+    for objects, level in ((1, "check"), (len(result.map), "bad")):
+        wrong = halves(result, objects)
+        assert wrong.summary["doubtful_objects"] == pytest.approx(2 * objects, rel=0.2)
+        assert wrong.summary["assessment"]["level"] == level
+    assert "the poses are likely worse than localization.xy (0.02 m)" in wrong.summary["assessment"]["reasons"][0]
+
+
 def test_objects_that_frames_show_together_are_two():
     # Their distance is less than two standard deviations, so nothing but the frames tells them apart.
     result = mapped(simulate(pair(0.08, pixel_sigma=1.0), 1))

@@ -88,3 +88,17 @@ def test_errors_that_only_the_given_poses_show_are_named(heading, labels, told):
     found = check_neighbours(solution, None, settings, earlier)
     assert (found is not None and found.name == UNTOLD) == told
     assert check_neighbours(solution, None, settings) is None
+
+
+def test_auto_solves_the_poses_too_if_many_objects_at_them_are_doubtful(monkeypatch):
+    """Localised poses that err slowly show each thing at another place in each visit. The boxes of a visit agree."""
+    log = simulate(preset("demo"), 3)
+    log = replace(log, odometry=None)
+    ledger = Ledger()
+    assert pipeline.run(log, load_settings(None, QUIET), ledger).summary["mode"] == "fixed"
+    monkeypatch.setattr(pipeline, "mostly_doubtful", lambda summary: summary["mode"] == "fixed")
+    solved = pipeline.run(log, load_settings(None, QUIET), ledger)
+    assert solved.summary["mode"] == "joint"
+    assert any("many objects at the localised poses are doubtful" in one for one in ledger.lines())
+    held = load_settings(None, (*QUIET, "mode=fixed"))
+    assert pipeline.run(log, held, Ledger()).summary["mode"] == "fixed"
