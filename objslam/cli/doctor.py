@@ -102,7 +102,7 @@ def _show_trials(found: Diagnosis) -> None:
     from rich.table import Table
 
     if not found.trials:
-        say("there are too few boxes to judge how well they agree")
+        say(f"how well the boxes agree is not judged: {found.uncompared or 'no two of them can be compared'}")
         return
     if not found.findings:
         first, *others = found.trials

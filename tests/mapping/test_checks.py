@@ -10,7 +10,7 @@ from added_errors import add_shared_errors
 from more_boxes import with_boxes
 from quick import NOTHING_DRAWN
 from scipy.spatial.transform import Rotation
-from small_log import small_log
+from small_log import crowded, small_log
 from wrong_inputs import MISTAKES, join
 
 from objslam.config import Odometry, load_settings
@@ -645,3 +645,21 @@ def test_boxes_that_end_at_the_edge_of_the_image_belong_to_it(edge, tried, squar
     assert ("boxes of a square of 640" in names) == square
     assert ("boxes of a square of 320" in names) == tried
     assert {"image mirrored", "boxes yxyx"} <= set(names)
+
+
+def test_a_diagnosis_says_why_the_boxes_were_not_compared():
+    """The doctor must not call thousands of boxes too few."""
+    log = small_log()
+    few = log.cameras[0].detections.take(np.arange(len(log.cameras[0].detections)) < 30)
+    sparse = replace(log, cameras=(replace(log.cameras[0], detections=few),))
+    crowd = crowded(log, np.arange(80), 100)
+    for one, more, why in (
+        (log, (), ""),
+        (sparse, (), "there are only 30 of them, and 60 are needed"),
+        (crowd, (), "so many things of one label"),
+        (log, ("localization.xy=2",), "the localisation errs by much"),
+    ):
+        found = diagnose(one, load_settings(None, ("mode=fixed", *more)), Ledger(), thorough=True)
+        assert why in found.uncompared
+        assert bool(found.uncompared) == bool(why)
+        assert not (found.trials and why)

@@ -59,13 +59,15 @@ class Diagnosis:
     """The faults of a log. trials: the tried hypotheses. The first trial is the unchanged log. Empty if none were tried.
 
     errors: small errors of the calibration that a run does not correct, None if there are none. jumps: of the localisation.
-    A run takes them out. None if there are none.
+    A run takes them out. None if there are none. uncompared: why the boxes were not compared with each other, "" if they
+    were.
     """
 
     findings: tuple[Finding, ...] = ()
     trials: tuple[Trial, ...] = ()
     errors: SmallErrors | None = None
     jumps: Jumps | None = None
+    uncompared: str = ""
 
     @property
     def spoilt(self) -> bool:
@@ -124,10 +126,12 @@ def _diagnosed(log: Log, settings: Settings, ledger: Ledger, progress: Progress,
     impossible = any(finding.spoils for finding in of_path)
     findings = [*([stamps] if stamps else []), *of_path, *check_boxes(log, ledger)]
     if not any(len(c.detections.frame_stamps) for c in log.cameras if c.detections is not None):
-        return Diagnosis(tuple(findings))
+        return Diagnosis(tuple(findings), uncompared="there are no boxes")
     part = bounded_part(log, settings)
-    if part.crowd > _CROWD or (log.localization is not None and coarse(settings)):
-        return Diagnosis(tuple(findings))
+    if log.localization is not None and coarse(settings):
+        return Diagnosis(tuple(findings), uncompared="the settings say that the localisation errs by much (localization.xy)")
+    if part.crowd > _CROWD:
+        return Diagnosis(tuple(findings), uncompared="there are so many things of one label that their rays meet anywhere")
     found = agreement(part, part.log, settings)
     trials: list[Trial] = []
     if part.boxes >= _FEWEST:
@@ -159,7 +163,8 @@ def _diagnosed(log: Log, settings: Settings, ledger: Ledger, progress: Progress,
                 findings.append(Finding("calibration", f"{cause} ({errors.remedy(settings)} estimates it)", spoils=False))
         ranges = check_ranges(found, part)
         findings += [ranges] if ranges else []
-    return Diagnosis(tuple(findings), tuple(trials), errors)
+    few = "" if part.boxes >= _FEWEST else f"there are only {part.boxes} of them, and {_FEWEST} are needed"
+    return Diagnosis(tuple(findings), tuple(trials), errors, uncompared=few)
 
 
 def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:

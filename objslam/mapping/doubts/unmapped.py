@@ -64,7 +64,7 @@ def _doubt(result: RunResult, evidence: Evidence, label: int, frames: int, cut: 
         "label",
         reason,
         name,
-        f"No object has the label {name!r}, which {frames} frames show: {why}.",
+        f"No object has the label {name!r}, which {frames} frames show. {why[0].upper()}{why[1:]}.",
         (),
         place,
         mine,
@@ -73,8 +73,8 @@ def _doubt(result: RunResult, evidence: Evidence, label: int, frames: int, cut: 
 
 
 def _why(result: RunResult, evidence: Evidence, mine: Ints, parallax: float, cut: int) -> tuple[str, str, Floats | None]:
-    """Return why the boxes `mine` (B,) of a label are no object. The three values are the reason in short, the reason as the
-    end of a sentence, and the place (3,) of the boxes. The place is None if the boxes have none. parallax: deg.
+    """Return why the boxes `mine` (B,) of a label are no object. The three values are the reason in short, the reason as a
+    sentence, and the place (3,) of the boxes. The place is None if the boxes have none. parallax: deg.
     """
     settings, edge = result.settings, "the image's edge cuts off"
     least = settings.association.min_rays
@@ -87,7 +87,7 @@ def _why(result: RunResult, evidence: Evidence, mine: Ints, parallax: float, cut
         return "no parallax", f"its {len(mine)} rays span {parallax:.1f} deg, too little to measure a distance", None
     group = described_group(evidence, mine, settings)
     reason, place = REASONS[group.reason[0]], group.position[0]
-    also = f"; {edge} {cut} more boxes" if cut else ""
+    also = f". {edge.capitalize()} {cut} more boxes" if cut else ""
     where = "" if reason == "apart" else f" near {in_place(place)}"
     told = f"its {len(mine)} boxes{where}{why_no_object(result, group, 0, mine)}{also}"
     return reason, told, None if reason == "apart" else place
