@@ -16,8 +16,10 @@ from objslam.config import Settings
 from objslam.core.result import Doubt, RunResult
 from objslam.core.types import Log
 from objslam.mapping.doubts import words
+from objslam.mapping.doubts.evidence import evidence_of
 from objslam.mapping.doubts.find import _praised
 from objslam.mapping.doubts.groups import REASONS
+from objslam.mapping.doubts.pairs import find_pairs
 from objslam.mapping.doubts.sizes import _LEAST, _alike, mixed_sizes
 from objslam.simulation import pair, preset, simulate
 from objslam.simulation.settings import DepthNoise
@@ -76,6 +78,9 @@ def test_one_object_taken_as_two_may_be_one():
     assert set(found.rays) == set(mine)
     first, second = (result.map[4].label + f" #{one}" for one in (4, count))
     assert found.text.endswith(f" {first} was seen before {second}, so it may have moved from one place to the other.")
+    pairs = find_pairs(evidence_of(doubtful))
+    near = next(words._pairs(doubtful, replace(pairs, sigmas=np.full(len(pairs.sigmas), 0.5))))
+    assert "moved" not in near.text  # Both places are one.
     for share in (2, 3):  # If their boxes alternate in time, it cannot have moved.
         later[mine] = np.where(np.arange(len(mine)) % share, 4, count)
         assert words._if_moved(reassociated(result, later), 4, count) == ""

@@ -25,6 +25,9 @@ number, fewer objects are said to have rays that disagree."""
 _SPAN = (0.1, 0.9)
 """The quantiles of the stamps of an object's boxes that say when it was seen. Single boxes of other things do not count. A
 wider span finds fewer pairs whose boxes follow one another in time."""
+_MOVED = 1.0
+"""A pair may be one thing that moved if its places differ by at least this number of sigmas. Nearer places are
+one place. With a larger number, fewer pairs are said to be things that moved."""
 _BESIDE = 0.5
 """A sentence names the nearest object up to this distance (m), if the object has the label of the boxes. An object of
 another label is named within its own size. A larger distance names more objects."""
@@ -77,7 +80,7 @@ def _pairs(result: RunResult, pairs: Pairs) -> Iterator[Doubt]:
             "may be one",
             a.label,
             f"{_name(a)} and {_name(b)} may be one (probability {pairs.probability[i]:.2f}): they are {_length(apart)} "
-            f"apart, {pairs.sigmas[i]:.1f} sigma; {frames}.{_if_moved(result, j, k)}",
+            f"apart, {pairs.sigmas[i]:.1f} sigma; {frames}.{_if_moved(result, j, k) if pairs.sigmas[i] >= _MOVED else ''}",
             (a.id, b.id),
             (a.position + b.position) / 2,
             np.flatnonzero(np.isin(result.association.object, [j, k])),
