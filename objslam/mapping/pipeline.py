@@ -107,7 +107,7 @@ def run(
             ledger.restore(at_poses)
             return result
     # Without odometry, the second solve takes the noise of the localisation from the rays.
-    untold = settings.finds_localization_noise and (found.lasting is not None or mostly_doubtful(result.summary))
+    untold = settings.finds_localization_noise and (found.lasting is not None or mostly_doubtful(result))
     if settings.mode != "auto" or not wrong or (chosen_poses(log, settings).odometry is None and not untold):
         return result
     at_poses = ledger.copy()
@@ -313,7 +313,7 @@ def _run(
         why = "no object has a place at the localised poses"
     # A joint solve may refute what boxes show.
     testable = open_mode and settings.mode == "fixed" and settings.checks.use and not diagnosis.certain
-    doubtful, unclear = mostly_doubtful(result.summary), result.summary["assessment"]["level"] != "good"
+    doubtful, unclear = mostly_doubtful(result), result.summary["assessment"]["level"] != "good"
     if not why and testable and unclear and odometry_contradicts(given, settings):
         why = "the odometry shows that the localisation errs for seconds"
     why = why or ("many objects at the localised poses are doubtful" if testable and doubtful else "")

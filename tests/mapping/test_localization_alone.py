@@ -96,7 +96,7 @@ def test_auto_solves_the_poses_too_if_many_objects_at_them_are_doubtful(monkeypa
     log = replace(log, odometry=None)
     ledger = Ledger()
     assert pipeline.run(log, load_settings(None, QUIET), ledger).summary["mode"] == "fixed"
-    monkeypatch.setattr(pipeline, "mostly_doubtful", lambda summary: summary["mode"] == "fixed")
+    monkeypatch.setattr(pipeline, "mostly_doubtful", lambda result: result.summary["mode"] == "fixed")
     solved = pipeline.run(log, load_settings(None, QUIET), ledger)
     assert solved.summary["mode"] == "joint"
     assert any("many objects at the localised poses are doubtful" in one for one in ledger.lines())

@@ -124,16 +124,15 @@ def with_doubts(result: RunResult) -> RunResult:
             named = [*of_objects, *lost, *named]
         named += [*_of_moved_things(found.groups, result), *in_assessment(unmapped), *cut_off.in_assessment(cut, result)]
         summary["assessment"] = {**assessment, "reasons": [*assessment["reasons"], *named]}
-        if mostly_doubtful(summary):
+        if mostly_doubtful(replace(result, summary=summary)):
             reasons = [_of_doubtful(doubtful, result), *summary["assessment"]["reasons"]]
             summary["assessment"] = {"level": "bad", "reasons": reasons}
     return replace(result, doubts=doubts, summary=summary)
 
 
-def mostly_doubtful(summary: dict[str, Any]) -> bool:
-    """Return whether so many objects are doubtful that their map is bad. summary: of a result with its doubts."""
-    doubtful, counts = summary["doubtful_objects"], summary["counts"]
-    return bool(doubtful >= max(_FEWEST_DOUBTFUL, _DOUBTFUL * (counts["objects"] - counts["unresolved"])))
+def mostly_doubtful(result: RunResult) -> bool:
+    """Return whether so many objects of a result with its doubts are doubtful that its map is bad."""
+    return bool(result.summary["doubtful_objects"] >= max(_FEWEST_DOUBTFUL, _DOUBTFUL * len(result.map.resolved())))
 
 
 def _doubtful_objects(doubts: tuple[Doubt, ...], result: RunResult) -> int:
