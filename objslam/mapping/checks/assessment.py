@@ -162,7 +162,7 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         uncalibrated=summary.get("uncalibrated", False),
         odometry=max((summary.get("noise") or {}).get(name, 1.0) for name in ("along", "across", "turning")),
         poses=max((summary.get("noise") or {}).get(name, 1.0) for name in ("heading", "place")),
-        scale=_untold_scale(summary),
+        scale=untold_scale(summary),
         depths="range_scale" in (summary.get("calibration") or {}).get("parameters", {}),
         part=(summary["part"]["begin"], summary["part"]["end"]) if "part" in summary else (None, None),
         odometry_unused=summary.get("odometry_unused", False),
@@ -189,7 +189,8 @@ def lost_input(unused: Sequence[str], malformed: int, frames: int) -> list[str]:
     return found
 
 
-def _untold_scale(summary: dict[str, Any]) -> float | None:
+def untold_scale(summary: dict[str, Any]) -> float | None:
+    """Return the standard deviation of the scale of the odometry, as a share, if the log does not show it, else None."""
     scale = (summary.get("calibration") or {}).get("parameters", {}).get("odometry.scale")
     return None if scale is None or scale["observable"] else scale["sigma"]
 

@@ -6,9 +6,10 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.bodies.body import Body
-from objslam.core.maps.shared_covariance import jacobian, own_part, root_of
+from objslam.core.maps.shared_covariance import SIZE, jacobian, own_part, root_of
 from objslam.core.object_map import MapObject
 from objslam.core.result import Doubt, RunResult
+from objslam.mapping.checks.assessment import untold_scale
 
 _NAMED = 3
 """The most objects that the assessment names. A larger number makes the assessment longer."""
@@ -26,15 +27,18 @@ good."""
 def unsure_objects(result: RunResult) -> list[Doubt]:
     """Return a doubt for each object with a position whose sigma exceeds `triangulation.sure_sigma`, the least sure first.
 
-    The error that all objects share does not count: it moves the map, and a robot in it, as a whole.
+    The error that all objects share does not count: it moves the map, and a robot in it, as a whole. So does a scale of the
+    odometry that the log does not show. The covariance of the shared error contains only a part of it if the path bends with
+    it.
     """
     known = [o for o in result.map if o.covariance is not None and o.status == "ok"]
     if not known:
         return []
     covariance = np.array([o.covariance for o in known])
     if result.map.shared_covariance is not None:
-        shared = jacobian(np.array([o.position for o in known])) @ root_of(result.map.shared_covariance)
-        covariance = own_part(covariance, shared)
+        shared = result.map.shared_covariance.copy()
+        shared[SIZE, SIZE] = max(shared[SIZE, SIZE], (untold_scale(result.summary) or 0.0) ** 2)
+        covariance = own_part(covariance, jacobian(np.array([o.position for o in known])) @ root_of(shared))
     variance, axes = np.linalg.eigh(covariance)
     sigma, direction = np.sqrt(variance[:, -1]), axes[:, :, -1]
     most = result.settings.triangulation.sure_sigma
