@@ -1,6 +1,7 @@
 """Colours, captions, ray lengths and the shown area of the map, for all pictures, recordings and exports."""
 
 import colorsys
+import re
 from collections import Counter
 from collections.abc import Sequence
 from typing import Literal
@@ -27,6 +28,11 @@ _HUES = 12
 harder to tell apart. With a smaller one, a label more often has another colour in a map with other labels. The number is
 even, so that the luminances alternate."""
 _NEXT = 5  # A label whose hue is taken tries the hue this many further on. It has no divisor in common with `_HUES`.
+_NAMED_HUES = {
+    **{"red": 0, "orange": 1, "yellow": 2, "lime": 3, "green": 4, "turquoise": 5, "cyan": 6},
+    **{"blue": 8, "violet": 9, "purple": 9, "magenta": 10, "pink": 11},
+}
+"""The hues, on the circle of `_HUES`, of words in labels: a red buoy that is drawn in blue misleads."""
 _SATURATION = 0.85  # The colours of labels have this saturation, in [0, 1].
 _LUMINANCES = (0.09, 0.17)
 """Neighbouring hues alternate between these relative luminances, in [0, 1], so that many colours stay distinct. Text in
@@ -90,20 +96,30 @@ def colours_of(labels: Sequence[str]) -> dict[str, tuple[float, float, float]]:
 def _slots(labels: Sequence[str]) -> dict[str, float]:
     """Return the place of each label on the circle of hues, from 0 to `_HUES`.
 
-    The place depends on the name, so that a label has one colour in all maps. If two names of a map have the same place, the
-    later one in the alphabet takes another place.
+    The place depends on the name, so that a label has one colour in all maps. A label that names a colour has it, or the
+    nearest free one. If two other names of a map have the same place, the later one in the alphabet takes another place.
     """
     slots: dict[str, float] = {}
     taken: set[int] = set()
-    for number, name in enumerate(sorted(set(labels))):
+    named = {name: _named_hue(name) for name in set(labels)}
+    for number, name in enumerate(sorted(named, key=lambda one: (named[one] is None, one))):
         if number % _HUES == 0:  # All hues are taken. The next labels lie between them: in the middle, then at the quarters.
             taken.clear()
-        slot = crc32(name.encode(errors="surrogatepass")) % _HUES
-        while slot in taken:
-            slot = (slot + _NEXT) % _HUES
+        hue, first = named[name], crc32(name.encode(errors="surrogatepass"))
+        if hue is None:
+            tried = [first + _NEXT * k for k in range(_HUES)]
+        else:  # The hue itself, and then its neighbours on both sides.
+            tried = [hue + (-1) ** k * ((k + 1) // 2) for k in range(_HUES)]
+        slot = next(one % _HUES for one in tried if one % _HUES not in taken)
         taken.add(slot)
         slots[name] = slot + _between(number // _HUES)
     return slots
+
+
+def _named_hue(label: str) -> int | None:
+    """Return the hue of the first word in a label that names a colour, None if none does."""
+    words = re.findall("[a-z]+", label.lower())
+    return next((_NAMED_HUES[word] for word in words if word in _NAMED_HUES), None)
 
 
 def _between(turn: int) -> float:

@@ -12,6 +12,7 @@ from synthetic_result import clusters, synthetic_result
 
 from objslam.core.bodies.body import Body, Shape
 from objslam.core.object_map import MapObject, ObjectMap
+from objslam.output.plot import style
 from objslam.output.plot.style import (
     DrawnShape,
     body_outline,
@@ -185,3 +186,18 @@ def test_a_sample_is_drawn_from_the_mask(size: int, count: int, seed: int) -> No
 
 def _object(number: int = 0, label: str = "cup") -> MapObject:
     return MapObject(number, label, np.zeros(3), None, "ok", 3, 3, 10.0, 0.1, 0.0, 1.0)
+
+
+def test_a_label_that_names_a_colour_has_it():
+    labels = ["blue_cone", "Red buoy", "red-cone", "green_buoy", "yellow cone", "person", "tired dog", "bluebell"]
+    found = colours_of(labels)
+    assert np.argmax([found[name] for name in ("Red buoy", "green_buoy", "blue_cone")], axis=1).tolist() == [0, 1, 2]
+    assert np.argmax(found["red-cone"]) == 0  # The nearest free hue is pink.
+    r, g, b = found["yellow cone"]
+    assert r == pytest.approx(g, abs=0.02)
+    assert b < r / 2
+    assert len({tuple(np.round(colour, 3)) for colour in found.values()}) == len(labels)
+    assert style._named_hue("tired dog") is style._named_hue("bluebell") is None
+    for count in (20, 40):  # Names of one colour, more than there are hues.
+        many = colours_of([f"red {i}" for i in range(count)])
+        assert len(set(many.values())) == count
