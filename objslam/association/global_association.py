@@ -302,20 +302,20 @@ def _without_ghosts(task: _Task, state: State, likely: Floats, sized: Bools) -> 
 def _without_crossings(task: _Task, state: State, likely: Floats, sized: Bools) -> tuple[State, Floats, Bools]:
     """Split landmarks that are two things whose rays cross. Then search again among the rays that this sets free.
 
-    Return what `_merged_and_dropped` returns. likely: (N,) of the landmarks. sized: (R,) whether the camera of each ray sees
-    sizes.
+    Return what `_merged_and_dropped` returns. likely: (N,). sized: (R,) whether the camera of each ray sees sizes.
     """
     refuted, earlier = np.zeros(len(state.matched), dtype=bool), set[bytes]()
+    tries = np.zeros(len(state.matched), dtype=np.int64)
     while (key := state.matched.tobytes()) not in earlier:  # Rays may return to the landmark that they left.
         earlier.add(key)
         found = find_crossings(state, sized, task.settings.min_rays)
-        if len(earlier) > _TURNS or not found.two.any():
+        two = found.untried(state, tries)
+        if len(earlier) > _TURNS or not two.any():
             break
-        split = _alternate(task, state.split(found.landmark[found.two], found.second, found.position[found.two]))
-        searched, dropped, _ = _search(task, split, split.landmarks.take(np.zeros(0, dtype=np.int64)))
-        refuted |= dropped
+        split = _alternate(task, state.split(found.landmark[two], found.second, found.position[two]))
+        searched, lost, _ = _search(task, split, split.landmarks.take(np.zeros(0, dtype=np.int64)))
         state, likely, dropped = _merged_and_dropped(task, searched)
-        refuted |= dropped
+        refuted |= lost | dropped
     return state, likely, refuted
 
 

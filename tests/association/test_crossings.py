@@ -106,6 +106,18 @@ def test_odds_tell_one_thing_from_two(seed: int) -> None:
     assert all(np.linalg.norm(found.position[0] - thing, axis=1).min() < 2.5 for thing in (AHEAD, BEYOND))
 
 
+def test_a_landmark_whose_rays_come_back_is_not_split_again() -> None:
+    scene = hall(2, np.array([AHEAD, BEYOND, *BESIDE]), step=0.04)
+    state, tries = true_state(scene, {1: 0}), np.zeros(len(scene.rays), dtype=np.int64)
+    found = find_crossings(state, np.ones(len(scene.rays), dtype=bool), 3)
+    others = state.assigned[state.owner != 0]
+    assert found.landmark[found.untried(state, tries)].tolist() == [0]
+    assert not tries[others].any()
+    assert not found.untried(state, tries).any()
+    tries[state.assigned[state.owner == 0][::2]] = 0  # Half of its rays are new.
+    assert found.landmark[found.untried(state, tries)].tolist() == [0]
+
+
 def test_sizes_tell_where_the_two_things_are() -> None:
     """Boxes grow as the robot drives at a thing, which tells its distance. Without sizes, bearings alone split nothing."""
     scene = hall(0, np.array([AHEAD, BEYOND, *BESIDE]))

@@ -42,6 +42,9 @@ _OFF_CENTRE = 0.02
 """The offset between the middle of a thing and the middles of its boxes in one bundle, as a share of the boxes' size.
 Perspective alone gives this share for a cube that is seen from six times its size. A larger share splits fewer large
 things."""
+_TRIES = 1
+"""A landmark is not split again if its rays were in split landmarks this many times on average. The rays of some landmarks
+come back after each split: of 17 in a drive between cones, the same ones up to eight times. A larger number takes longer."""
 _FREE = 3
 """The degrees of freedom of a second point."""
 _USUAL_GAIN = 2.366
@@ -70,6 +73,17 @@ class Crossings:
     def two(self) -> Bools:
         """Whether each landmark (S,) is clearly two things."""
         return self.odds < -_CLEAR
+
+    def untried(self, state: State, tries: Ints) -> Bools:
+        """Return which landmarks (S,) are clearly two things, and were not split `_TRIES` times already.
+
+        state: that of the landmarks. tries: (R,) how often each ray was in a split landmark. It counts these landmarks too.
+        """
+        number = np.bincount(state.owner, minlength=state.count)
+        before = np.bincount(state.owner, tries[state.assigned], state.count) / np.maximum(number, 1)
+        two = self.two & (before[self.landmark] < _TRIES)
+        tries[state.assigned[np.isin(state.owner, self.landmark[two])]] += 1
+        return np.asarray(two)
 
 
 def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
