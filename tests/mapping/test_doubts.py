@@ -17,7 +17,7 @@ from objslam.core.result import Doubt, RunResult
 from objslam.core.types import Log
 from objslam.mapping.doubts import words
 from objslam.mapping.doubts.evidence import evidence_of
-from objslam.mapping.doubts.find import _praised
+from objslam.mapping.doubts.find import _doubtful_objects, _praised
 from objslam.mapping.doubts.groups import REASONS
 from objslam.mapping.doubts.pairs import find_pairs
 from objslam.mapping.doubts.sizes import _LEAST, _alike, mixed_sizes
@@ -106,6 +106,8 @@ def test_a_map_of_many_doubles_is_bad_and_names_the_poses():
         wrong = halves(result, objects)
         assert wrong.summary["doubtful_objects"] == pytest.approx(2 * objects, rel=0.2)
         assert wrong.summary["assessment"]["level"] == level
+    unlikely = [replace(one, numbers={**one.numbers, "probability": 0.3}) for one in wrong.doubts if one.kind == "pair"]
+    assert _doubtful_objects(tuple(unlikely), wrong) == 0
     assert "the poses are likely worse than localization.xy (0.02 m)" in wrong.summary["assessment"]["reasons"][0]
 
 

@@ -29,9 +29,9 @@ _DOUBLE = 0.5
 """A pair of objects counts in the assessment if it is one object with at least this probability. With a larger value, more
 maps are good."""
 _DOUBTFUL = 0.4
-"""A map is bad if at least this share of its objects may be doubles, several things, or at a wrong place. In simulation,
-wrong maps had 0.41 and more, and right maps at most 0.16. A street with many parked cars had 0.34, and three quarters of its
-objects were right. With a larger share, fewer maps are bad."""
+"""A map is bad if at least this share of its objects are likely doubles, or may be several things or at a wrong place. In
+simulation, maps most of whose objects were wrong had 0.44 and more, and right maps at most 0.15. Two maps with a right path
+and a fifth to a third of false objects had 0.29 and 0.34. With a larger share, fewer maps are bad."""
 _FEWEST_DOUBTFUL = 8
 """The fewest doubtful objects of a bad map. With a larger number, fewer small maps are bad."""
 _LOST = (0.1, 0.5)
@@ -136,8 +136,9 @@ def mostly_doubtful(result: RunResult) -> bool:
 
 
 def _doubtful_objects(doubts: tuple[Doubt, ...], result: RunResult) -> int:
-    """Return the number of objects with a position that may be doubles, several things, or at a wrong place."""
-    named = {j for one in doubts if one.kind in ("pair", "split") for j in one.objects}
+    """Return the number of objects with a position that are likely doubles, or may be several things or at a wrong place."""
+    clear = [one for one in doubts if one.numbers.get("probability", 1.0) >= _DOUBLE]
+    named = {j for one in clear if one.kind in ("pair", "split") for j in one.objects}
     return sum(one.id in named for one in result.map.resolved())
 
 
