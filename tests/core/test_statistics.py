@@ -21,6 +21,7 @@ from objslam.core.statistics import (
     grouped_median,
     grouped_quantile,
     grouped_quantiles,
+    grouped_visits,
     log_beta,
     logistic,
     noise_factors,
@@ -163,3 +164,11 @@ def test_quantiles_of_large_groups_are_those_of_sorted_groups():
                 mine = np.sort(values[index == group])
                 expected = mine[min(int(share * len(mine)), len(mine) - 1)] if len(mine) else np.nan
                 np.testing.assert_array_equal(one, expected)
+
+
+def test_visits_end_at_gaps_and_belong_to_one_object():
+    stamps, index = np.array([9.0, 0.0, 1.0, 5.0, 1.5, 3.5]), np.array([2, 0, 2, 0, 0, 2])
+    visit = grouped_visits(stamps, index, 3.0)
+    together = [sorted(np.flatnonzero(visit == number).tolist()) for number in np.unique(visit)]
+    assert together == [[1, 4], [3], [2, 5], [0]]  # A gap of 3 s ends no visit, and one of 3.5 s does.
+    assert len(grouped_visits(np.zeros(0), np.zeros(0, dtype=np.int64), 3.0)) == 0

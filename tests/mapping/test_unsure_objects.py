@@ -52,15 +52,18 @@ def test_the_error_that_all_objects_share_makes_none_unsure() -> None:
     assert len(unsure(result_of(0.6, shared=3.0))) == 1
 
 
-@pytest.mark.parametrize(("observable", "doubts"), [(False, 0), (True, 1)])
-def test_a_scale_that_the_log_does_not_show_makes_no_far_object_unsure(observable: bool, doubts: int) -> None:
-    """A path that bends with the scale hides a part of it from the shared covariance."""
+@pytest.mark.parametrize(
+    ("observable", "frame", "doubts"), [(False, "odometry", 0), (True, "odometry", 1), (False, "map", 1)]
+)
+def test_a_scale_that_the_log_does_not_show_makes_no_far_object_unsure(observable: bool, frame: str, doubts: int) -> None:
+    """A path that bends with the scale hides a part of it from the shared covariance. In the frame of a localisation, the
+    odometry's scale does not move the map."""
     result = result_of()
     shared = np.zeros((7, 7))
     shared[6, 6] = 0.02**2
     far = replace(result.map[0], position=np.array([30.0, 20.0, 0.5]))
     far = replace(far, covariance=0.03**2 * np.outer(far.position, far.position) + 0.01 * np.eye(3))
-    objects = ObjectMap((far, *result.map.objects[1:]), shared_covariance=shared)
+    objects = ObjectMap((far, *result.map.objects[1:]), frame=frame, shared_covariance=shared)
     scale = {"parameters": {"odometry.scale": {"observable": observable, "sigma": 0.03}}}
     summary = {**result.summary, "calibration": scale}
     assert len(unsure(with_doubts(replace(result, map=objects, summary=summary)))) == doubts

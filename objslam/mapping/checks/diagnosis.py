@@ -142,8 +142,9 @@ def _diagnosed(log: Log, settings: Settings, ledger: Ledger, progress: Progress,
             if named is not None:
                 return Diagnosis((named, *findings), tuple(trials))
     errors: SmallErrors | None = None
+    few = "" if part.boxes >= _FEWEST else f"there are only {part.boxes} of them, and {_FEWEST} are needed"
     if impossible:  # Boxes at such poses agree with anything by chance.
-        return Diagnosis(tuple(findings), tuple(trials))
+        return Diagnosis(tuple(findings), tuple(trials), uncompared=few)
     if found is not None and part.boxes >= _FEWEST:
         doubted = bool(trials) and not part.drifts and not any(one.spoils for one in findings)
         doubted &= len(found.rays) >= _FEWEST
@@ -163,7 +164,6 @@ def _diagnosed(log: Log, settings: Settings, ledger: Ledger, progress: Progress,
                 findings.append(Finding("calibration", f"{cause} ({errors.remedy(settings)} estimates it)", spoils=False))
         ranges = check_ranges(found, part)
         findings += [ranges] if ranges else []
-    few = "" if part.boxes >= _FEWEST else f"there are only {part.boxes} of them, and {_FEWEST} are needed"
     return Diagnosis(tuple(findings), tuple(trials), errors, uncompared=few)
 
 

@@ -27,9 +27,9 @@ good."""
 def unsure_objects(result: RunResult) -> list[Doubt]:
     """Return a doubt for each object with a position whose sigma exceeds `triangulation.sure_sigma`, the least sure first.
 
-    The error that all objects share does not count: it moves the map, and a robot in it, as a whole. So does a scale of the
-    odometry that the log does not show. The covariance of the shared error contains only a part of it if the path bends with
-    it.
+    The error that all objects share does not count: it moves the map, and a robot in it, as a whole. In the frame of the
+    odometry, so does a scale of the odometry that the log does not show. The covariance of the shared error contains only a
+    part of it if the path bends with it.
     """
     known = [o for o in result.map if o.covariance is not None and o.status == "ok"]
     if not known:
@@ -37,7 +37,8 @@ def unsure_objects(result: RunResult) -> list[Doubt]:
     covariance = np.array([o.covariance for o in known])
     if result.map.shared_covariance is not None:
         shared = result.map.shared_covariance.copy()
-        shared[SIZE, SIZE] = max(shared[SIZE, SIZE], (untold_scale(result.summary) or 0.0) ** 2)
+        if result.map.frame == "odometry":
+            shared[SIZE, SIZE] = max(shared[SIZE, SIZE], (untold_scale(result.summary) or 0.0) ** 2)
         covariance = own_part(covariance, jacobian(np.array([o.position for o in known])) @ root_of(shared))
     variance, axes = np.linalg.eigh(covariance)
     sigma, direction = np.sqrt(variance[:, -1]), axes[:, :, -1]
