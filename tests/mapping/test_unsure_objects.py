@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 from synthetic_result import clusters, synthetic_result
 
+from objslam.config import load_settings
 from objslam.core.bodies.body import Body
+from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
 from objslam.core.result import Doubt, RunResult
 from objslam.mapping.doubts.find import with_doubts
+from objslam.mapping.pipeline import run
+from objslam.simulation import preset, simulate
 
 
 def result_of(*sigmas: float, shared: float = 0.0) -> RunResult:
@@ -53,7 +57,7 @@ def test_the_error_that_all_objects_share_makes_none_unsure() -> None:
 
 
 @pytest.mark.parametrize(
-    ("observable", "frame", "doubts"), [(False, "odometry", 0), (True, "odometry", 1), (False, "map", 1)]
+    ("observable", "frame", "doubts"), [(False, "odometry", 0), (True, "odometry", 1), (False, "localization", 1)]
 )
 def test_a_scale_that_the_log_does_not_show_makes_no_far_object_unsure(observable: bool, frame: str, doubts: int) -> None:
     """A path that bends with the scale hides a part of it from the shared covariance. In the frame of a localisation, the
@@ -63,9 +67,9 @@ def test_a_scale_that_the_log_does_not_show_makes_no_far_object_unsure(observabl
     shared[6, 6] = 0.02**2
     far = replace(result.map[0], position=np.array([30.0, 20.0, 0.5]))
     far = replace(far, covariance=0.03**2 * np.outer(far.position, far.position) + 0.01 * np.eye(3))
-    objects = ObjectMap((far, *result.map.objects[1:]), frame=frame, shared_covariance=shared)
+    objects = ObjectMap((far, *result.map.objects[1:]), shared_covariance=shared)
     scale = {"parameters": {"odometry.scale": {"observable": observable, "sigma": 0.03}}}
-    summary = {**result.summary, "calibration": scale}
+    summary = {**result.summary, "calibration": scale, "map_frame": frame}
     assert len(unsure(with_doubts(replace(result, map=objects, summary=summary)))) == doubts
 
 
@@ -80,8 +84,8 @@ def test_a_map_most_of_whose_objects_are_unsure_needs_a_look() -> None:
 @pytest.mark.parametrize(
     ("parallax", "frame", "depth_sigma", "told"),
     [
-        (12.0, "map", 0.1, "Drive around it, or past it nearby."),
-        (80.0, "map", 0.1, "A better localisation helps, and more views do not."),
+        (12.0, "localization", 0.1, "Drive around it, or past it nearby."),
+        (80.0, "localization", 0.1, "A better localisation helps, and more views do not."),
         (80.0, "odometry", 0.1, "Come back from there to things that were seen before."),
         (80.0, "odometry", 1.1, "Drive to where another side of it shows, or set its size: bodies.sizes={"),
     ],
@@ -94,5 +98,18 @@ def test_the_advice_is_of_use_against_the_cause(parallax: float, frame: str, dep
     wide = turn @ np.diag([1e-4, 0.36, 1e-4]) @ turn.T
     one, *others = result.map.objects
     one = replace(one, covariance=wide, body=body, parallax_deg=parallax)
-    result = with_doubts(replace(result, map=ObjectMap((one, *others), frame)))
+    summary = {**result.summary, "map_frame": frame}
+    result = with_doubts(replace(result, map=ObjectMap((one, *others)), summary=summary))
     assert told in unsure(result)[0].text
+
+
+@pytest.mark.parametrize(
+    ("poses", "told"), [("localization", "A better localisation helps"), ("odometry", "Come back from there")]
+)
+def test_the_advice_of_a_run_fits_its_poses(poses: str, told: str) -> None:
+    log = simulate(preset("demo"), 0)
+    every = ("output.recording=false", "mode=joint", f"poses.use={poses}", "triangulation.sure_sigma=0.001")
+    texts = [one.text for one in unsure(run(log, load_settings(None, every), Ledger()))]
+    wide = [text for text in texts if "Drive" not in text]
+    assert wide
+    assert all(told in text for text in wide)

@@ -34,10 +34,10 @@ def unsure_objects(result: RunResult) -> list[Doubt]:
     known = [o for o in result.map if o.covariance is not None and o.status == "ok"]
     if not known:
         return []
-    covariance = np.array([o.covariance for o in known])
+    covariance, by_odometry = np.array([o.covariance for o in known]), _in_odometry_frame(result)
     if result.map.shared_covariance is not None:
         shared = result.map.shared_covariance.copy()
-        if result.map.frame == "odometry":
+        if by_odometry:
             shared[SIZE, SIZE] = max(shared[SIZE, SIZE], (untold_scale(result.summary) or 0.0) ** 2)
         covariance = own_part(covariance, jacobian(np.array([o.position for o in known])) @ root_of(shared))
     variance, axes = np.linalg.eigh(covariance)
@@ -54,7 +54,7 @@ def unsure_objects(result: RunResult) -> list[Doubt]:
                 "wide sigma",
                 o.label,
                 f"{o.label} #{o.id} has a sigma of {sigma[i]:.2f} m in its least certain direction "
-                f"(triangulation.sure_sigma {most:g} m): {_why(o, float(sigma[i]), direction[i], result.map.frame)}",
+                f"(triangulation.sure_sigma {most:g} m): {_why(o, float(sigma[i]), direction[i], by_odometry)}",
                 (o.id,),
                 o.position,
                 np.flatnonzero(result.association.object == o.id),
@@ -64,8 +64,14 @@ def unsure_objects(result: RunResult) -> list[Doubt]:
     return found
 
 
-def _why(o: MapObject, sigma: float, direction: Floats, frame: str) -> str:
-    """Return the cause of a wide sigma (m), and what to do. direction: (3,) unit, of the sigma. frame: of the map."""
+def _in_odometry_frame(result: RunResult) -> bool:
+    """Return whether nothing but the odometry tells where the robot is. `ObjectMap.frame` is only the name of the frame."""
+    return bool(result.summary.get("map_frame") == "odometry")
+
+
+def _why(o: MapObject, sigma: float, direction: Floats, by_odometry: bool) -> str:
+    """Return the cause of a wide sigma (m), and what to do. direction: (3,) unit, of the sigma. by_odometry: whether the map
+    lies in the frame of the odometry."""
     if o.body is not None and _sigma_by_size(o.body, direction) >= _BY_BODY * sigma:
         return (
             "its boxes do not show how far it goes on in this direction. Drive to where another side of it shows, or set "
@@ -74,7 +80,7 @@ def _why(o: MapObject, sigma: float, direction: Floats, frame: str) -> str:
     span = f"its {o.rays} rays span {o.parallax_deg:.1f} deg"
     if o.parallax_deg < _WIDE:
         return f"{span}. Drive around it, or past it nearby."
-    if frame == "odometry":
+    if by_odometry:
         return f"{span}, so it is the path that is not sure there. Come back from there to things that were seen before."
     return f"{span}, so it is the poses that are not sure there. A better localisation helps, and more views do not."
 
