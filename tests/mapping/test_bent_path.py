@@ -12,6 +12,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.statistics import WHITE, Lasting
 from objslam.mapping import pipeline
 from objslam.mapping.joint.path_against_localization import BENT_PATH, check_bent_path, sigmas_of_pieces
+from objslam.mapping.stages import described
 
 SIGMA, STAMPS = 0.02, np.arange(0.0, 200.0, 0.25)
 
@@ -89,7 +90,7 @@ def test_a_run_names_the_path_that_is_bent(bend, monkeypatch):
         moved = replace(solution, estimate=replace(solution.estimate, map_T_base=path))
         return check_bent_path(moved, errors, settings)
 
-    monkeypatch.setattr(pipeline, "check_bent_path", bent)
+    monkeypatch.setattr(described, "check_bent_path", bent)
     result = pipeline.run(
         small_log(odometry=Odometry()), load_settings(None, ("mode=joint", "output.recording=false")), Ledger()
     )

@@ -27,6 +27,7 @@ from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis, with_camera
 from objslam.mapping.checks.hypotheses.trials import Trial, verdict
 from objslam.mapping.checks.path import check_path
 from objslam.mapping.checks.stamps import check_stamps
+from objslam.mapping.stages import described
 from objslam.simulation import DepthNoise, PoseNoise, make_camera, preset, simulate
 from objslam.sources import read
 from objslam.sources.log_folder import write_log_folder
@@ -492,7 +493,7 @@ def test_small_errors_widen_the_covariances_to_the_true_errors(name, monkeypatch
     # The offsets of boxes, and lasting errors of poses, would take in a part of these errors, because the rays of different
     # sides and visits disagree.
     with monkeypatch.context() as alone:
-        alone.setattr(pipeline, "with_lasting_errors", lambda solution, *_: (solution, None))
+        alone.setattr(described, "with_lasting_errors", lambda solution, *_: (solution, None))
         plain = sigmas_off(run(log, "fixed", known, "checks.use=false", "rays.box_sigma=0"))
     assert np.median(plain) > 5
     assert np.median(widened) < 1.5

@@ -12,6 +12,7 @@ from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.mapping import pipeline
 from objslam.mapping.fixed.far_sides import far_sigma, with_far_sides
+from objslam.mapping.stages import described
 from objslam.simulation import preset, simulate
 
 
@@ -30,7 +31,7 @@ def test_the_far_end_of_a_depth_from_two_views_is_reached_as_often_as_promised(s
 
 def test_only_objects_without_ranges_that_were_seen_from_one_side_become_wider(monkeypatch):
     made = []
-    monkeypatch.setattr(pipeline, "with_far_sides", lambda solution: made.append(solution) or with_far_sides(solution))
+    monkeypatch.setattr(described, "with_far_sides", lambda solution: made.append(solution) or with_far_sides(solution))
     log = simulate(preset("demo", odometry=None, objects=6, classes=6, frames=150, false=0.0), 0)
     settings = load_settings(None, ("mode=fixed", *HELD, "output.recording=false"))
     pipeline.run(log, settings, Ledger())

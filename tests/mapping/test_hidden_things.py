@@ -14,6 +14,7 @@ from objslam.mapping import pipeline
 from objslam.mapping.bodies import fitting
 from objslam.mapping.bodies.boxes_in_front import edges_behind_boxes, with_hidden_parts
 from objslam.mapping.solution import CentreShift
+from objslam.mapping.stages import described
 from objslam.triangulation.bodies import solve
 from objslam.triangulation.bodies.hidden_edges import Hidden
 
@@ -102,7 +103,7 @@ def stages():
     log, made = hiding_drive(0, frames=200), {}
 
     def noted(name):
-        given = getattr(pipeline, name)
+        given = getattr(described, name)
 
         def stage(solution, *arguments):
             made[name] = solution, given(solution, *arguments)
@@ -112,7 +113,7 @@ def stages():
 
     with pytest.MonkeyPatch.context() as patch:
         for name in ("with_bodies", "with_box_offsets"):
-            patch.setattr(pipeline, name, noted(name))
+            patch.setattr(described, name, noted(name))
         pipeline.run(log, SETTINGS, Ledger())
     return log, made
 

@@ -18,6 +18,7 @@ from objslam.core.types import Log
 from objslam.errors import SolveError
 from objslam.mapping import pipeline
 from objslam.mapping.fixed.lasting_noise import _FACTORS, _KINDS, _LOOSE, TIMES, Cells, _misfits, lasting_variances
+from objslam.mapping.stages import described
 from objslam.simulation import PoseNoise, preset, simulate
 
 
@@ -38,7 +39,7 @@ def test_errors_of_poses_that_last_are_in_the_covariances(monkeypatch):
         log = simulate(preset("demo", odometry=None, objects=12, classes=12, frames=300, false=0.0, **noise), seed)
         logs.append(with_lasting(log, 2.5, 16.0, seed))
     found = np.concatenate([squares(log) for log in logs])
-    monkeypatch.setattr(pipeline, "with_lasting_errors", lambda solution, *_: (solution, None))
+    monkeypatch.setattr(described, "with_lasting_errors", lambda solution, *_: (solution, None))
     without = np.concatenate([squares(log) for log in logs])
     # An honest median is 2.4. A drive of one minute has few independent errors of 16 s, and its objects share them.
     assert np.median(without) > 30
@@ -47,8 +48,10 @@ def test_errors_of_poses_that_last_are_in_the_covariances(monkeypatch):
 
 def test_the_status_of_an_object_knows_its_lasting_errors(monkeypatch):
     """`seen_sigma` decides whether an object is resolved."""
-    made, wider = [], pipeline.with_lasting_errors
-    monkeypatch.setattr(pipeline, "with_lasting_errors", lambda *given: made.append((given[0], wider(*given))) or made[0][1])
+    made, wider = [], described.with_lasting_errors
+    monkeypatch.setattr(
+        described, "with_lasting_errors", lambda *given: made.append((given[0], wider(*given))) or made[0][1]
+    )
     log = simulate(preset("demo", odometry=None, objects=6, classes=6, frames=150, false=0.0), 0)
     squares(with_lasting(log, 2.5, 16.0, 0))
     before, after = made[0][0].estimate, made[0][1][0].estimate
@@ -137,8 +140,8 @@ def test_objects_that_were_seen_once_show_the_errors_that_they_share():
 
 def test_lasting_errors_are_the_same_with_any_axis_up_and_reach_heights_in_3d(monkeypatch):
     """A map on its side is the same map. Poses in a plane do not err in height, and other poses do."""
-    made, wider = [], pipeline.with_lasting_errors
-    monkeypatch.setattr(pipeline, "with_lasting_errors", lambda *given: made.append(given) or wider(*given))
+    made, wider = [], described.with_lasting_errors
+    monkeypatch.setattr(described, "with_lasting_errors", lambda *given: made.append(given) or wider(*given))
     log = simulate(preset("demo", odometry=None, objects=6, classes=6, frames=150, false=0.0, pixel_sigma=1.0), 0)
     log = with_lasting(log, 2.5, 16.0, 0)
     squares(log)

@@ -17,6 +17,7 @@ from objslam.mapping import pipeline
 from objslam.mapping.checks.diagnosis import Diagnosis
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.hypotheses.disagreement import DISAGREE
+from objslam.mapping.stages import described, measurements, solved
 from objslam.simulation import PoseNoise, preset, simulate
 
 pytestmark = pytest.mark.usefixtures("one_start")
@@ -79,7 +80,7 @@ def metres_off() -> Log:
 
 def without_boxes_that_tell(monkeypatch) -> None:
     for check in ("check_lasting_noise", "check_pose_noise", "check_residuals"):
-        monkeypatch.setattr(pipeline, check, lambda *_, **__: None)
+        monkeypatch.setattr(described, check, lambda *_, **__: None)
 
 
 @pytest.mark.long
@@ -120,7 +121,7 @@ def test_wrong_input_is_named_before_the_solve_unless_a_second_solve_may_refute_
 ):
     message, ledger = "the boxes disagree with the poses", Ledger()
     monkeypatch.setattr(
-        pipeline, "diagnose", lambda *given: Diagnosis((Finding(DISAGREE, message, spoils=False, basis=basis),))
+        measurements, "diagnose", lambda *given: Diagnosis((Finding(DISAGREE, message, spoils=False, basis=basis),))
     )
 
     class Solved(Exception):
@@ -129,7 +130,7 @@ def test_wrong_input_is_named_before_the_solve_unless_a_second_solve_may_refute_
     def solve(*given, **named):
         raise Solved(message in ledger.warnings)
 
-    monkeypatch.setattr(pipeline, "solve", solve)
+    monkeypatch.setattr(solved, "solve", solve)
     log = drive() if odometry else replace(drive(), odometry=None)
     with pytest.raises(Solved) as begun:
         pipeline.run(log, load_settings(None, (*HELD, "checks.use=true", *more)), ledger)

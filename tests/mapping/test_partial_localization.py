@@ -11,6 +11,7 @@ from objslam.core.types import Log, Trajectory
 from objslam.errors import SolveError
 from objslam.mapping import pipeline
 from objslam.mapping.checks.stamps import check_stamps
+from objslam.mapping.stages import solved
 from objslam.simulation import preset, simulate
 
 QUIET = ("bodies.use=false", "output.recording=false")
@@ -58,14 +59,14 @@ def test_a_late_localisation_has_no_other_clock():
 
 
 def test_a_log_whose_poses_cannot_be_solved_is_mapped_at_the_localised_ones(monkeypatch):
-    solve = pipeline.solve
+    solve = solved.solve
 
     def failing(frames, rays, cameras, settings, *more, **named):
         if settings.mode == "joint":
             raise SolveError("singular")
         return solve(frames, rays, cameras, settings, *more, **named)
 
-    monkeypatch.setattr(pipeline, "solve", failing)
+    monkeypatch.setattr(solved, "solve", failing)
     ledger = Ledger()
     result = pipeline.run(partial(lambda t: t > 0.4), load_settings(None, QUIET), ledger)
     assert result.summary["mode"] == "fixed"

@@ -15,6 +15,7 @@ from objslam.frontend.surface_ranges import centre_factors, to_centres
 from objslam.mapping import pipeline
 from objslam.mapping.bodies import fitting
 from objslam.mapping.solution import RangeShift
+from objslam.mapping.stages import solved
 
 JOINT = ("mode=joint", "poses.use=odometry", "output.recording=false", "checks.use=false")
 
@@ -22,14 +23,14 @@ JOINT = ("mode=joint", "poses.use=odometry", "output.recording=false", "checks.u
 def mapped(log, *changes):
     """The scores, after an alignment with a scale, and the solution, of a run from odometry alone."""
     settings, found = load_settings(None, (*JOINT, *changes)), []
-    given = pipeline.solve
+    given = solved.solve
 
     def noted(*args, **more):
         found.append(given(*args, **more))
         return found[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "solve", noted)
+        patch.setattr(solved, "solve", noted)
         result = pipeline.run(log, settings, Ledger())
     return evaluate(result.map, log.truth, result.path_after, align="sim2", radius=1.0).objects, found[-1]
 
