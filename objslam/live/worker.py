@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import queue
 import struct
 import subprocess
 import sys
@@ -151,13 +152,24 @@ def _read(pipe: IO[bytes]) -> bytes | None:
 
 
 def main() -> None:
-    """Read requests from stdin, and write their answers to stdout."""
+    """Read requests from stdin, and write their answers to stdout, until stdin ends."""
     os.nice(_NICE)
+    requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=_receive, args=(requests,), name="requests", daemon=True).start()
     with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as answers:
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # What a library prints must not get between the answers.
-        while (content := _read(sys.stdin.buffer)) is not None:
-            request: Request[object] = pickle.loads(content)  # noqa: S301 - this program wrote it
+        while True:
+            request: Request[object] = pickle.loads(requests.get())  # noqa: S301 - this program wrote it
             _write(answers, pickle.dumps(request.solve()))
+
+
+def _receive(requests: queue.SimpleQueue[bytes]) -> None:
+    """Read requests until stdin ends, and then end this process. A session that was killed closes stdin, and does not do
+    more."""
+    with os.fdopen(os.dup(sys.stdin.fileno()), "rb") as asked:  # Python waits for the lock of sys.stdin when it ends.
+        while (content := _read(asked)) is not None:
+            requests.put(content)
+    os._exit(0)
 
 
 if __name__ == "__main__":

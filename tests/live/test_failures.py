@@ -4,12 +4,13 @@ import errno
 import importlib
 import json
 import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from quick import HELD, NOTHING_DRAWN, options
-from waiting import LIMIT
+from waiting import LIMIT, wait_for
 
 from objslam.config import Odometry, load_settings
 from objslam.errors import LogError, SolveError
@@ -280,3 +281,23 @@ def test_what_is_said_of_a_source_that_breaks_is_one_line(folder, command, tmp_p
     code, lines = command(folder, tmp_path / "out", "--speed", "0")
     assert code == 0
     assert "warning: the source ended: the plug was pulled" in lines
+
+
+class Asleep:
+    """A request that is never answered."""
+
+    def __reduce__(self):
+        return time.sleep, (1e6,)
+
+
+def test_a_worker_ends_with_its_session_in_the_middle_of_a_request(own_processes):
+    """A killed session cannot end its worker, but its end of the pipe closes."""
+    worker = Worker()
+    worker.ask(Asleep())
+    try:
+        wait_for(lambda: not worker._waiting)
+        worker._process.stdin.close()
+        assert worker._process.wait(LIMIT) == 0
+        assert worker.result() is None
+    finally:
+        worker.close()
