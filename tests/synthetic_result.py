@@ -10,7 +10,8 @@ from objslam.core.camera import Camera
 from objslam.core.geometry import inverse, lift_se2, make_pose
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
-from objslam.core.types import Association, Keyframes, Rays, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Association, Keyframes, Rays, Truth, TruthObject
 
 OPTICAL = make_pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.0, 0.4]))
 

@@ -17,7 +17,8 @@ from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3
 from objslam.core.result import RunResult
-from objslam.core.types import Log, Trajectory, Truth
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log, Truth
 from objslam.errors import ConfigError
 from objslam.evaluation.alignment import Alignment
 from objslam.evaluation.evaluate import ObjectScores, evaluate

@@ -8,7 +8,8 @@ from objslam.config import load_settings
 from objslam.core.camera import Camera, project
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2, make_pose
-from objslam.core.types import CameraLog, Detections, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import shared_errors

@@ -7,7 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from objslam.core.geometry import lift_se2, make_pose, split_se2
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 
 
 def add_shared_errors(log: Log, errors: Mapping[str, float]) -> Log:

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
 from objslam.simulation import preset, simulate

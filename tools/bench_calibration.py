@@ -27,7 +27,8 @@ from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import align, interpolate, inverse
 from objslam.core.result import RunResult
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.mapping import pipeline
 from objslam.simulation import preset, simulate
 

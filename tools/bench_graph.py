@@ -20,7 +20,8 @@ from custom_factor import eq1_factor
 from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3, inverse, lift_se2
-from objslam.core.types import Association, Keyframes, Rays, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Association, Keyframes, Rays
 from objslam.frontend.odometry_drift import gathered_drift
 from objslam.graph.batch_solver import solve_fixed, solve_joint
 from objslam.graph.factors.bearing import bearings, point_to_line

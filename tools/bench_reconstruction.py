@@ -29,7 +29,8 @@ from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import align, interpolate, make_pose
 from objslam.core.result import Surface
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.errors import OutputError
 from objslam.io.detections_jsonl import read_detections
 from objslam.mapping import pipeline

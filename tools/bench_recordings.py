@@ -36,7 +36,8 @@ from ycbv import RUNS, read_ycbv
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.result import RunResult
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.errors import ObjslamError
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline

@@ -45,7 +45,8 @@ from objslam.core.geometry import inverse, lift_se2, make_pose
 from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.rotation import rotation_from_vector
-from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log, Truth, TruthObject
 from objslam.errors import ObjslamError
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline

@@ -25,7 +25,8 @@ from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.result import RunResult
 from objslam.core.snapshot import Snapshot
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.live.session import low_latency
 from objslam.mapping import pipeline
 from objslam.output.plot.style import ray_ends

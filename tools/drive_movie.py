@@ -29,8 +29,8 @@ from objslam.core.geometry import interpolate
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import Surface
 from objslam.core.snapshot import CameraFrame
-from objslam.core.trajectory import correct_path
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory, correct_path
+from objslam.core.types import Log
 from objslam.errors import OutputError
 from objslam.io.detections_jsonl import read_detections
 from objslam.io.results.files import CONFIG, DETECTIONS, SURFACE

@@ -4,7 +4,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.geometry import interpolate, inverse, lift_se2
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 
 KINDS = ("filter", "poses", "slam", "satellites")
 EVERY = 0.1  # s, between two poses of a scan matcher, and the steps at which the errors of a particle filter are drawn

@@ -6,7 +6,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.geometry import lift_se2
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 
 SLIDES = 0.1
 """The spread over robots of the share by which wheels with rollers seem to go farther sideways than they do."""

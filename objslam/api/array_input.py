@@ -36,7 +36,7 @@ def as_pose(values: ArrayLike) -> Floats:
 
 
 def as_stamps(values: ArrayLike) -> Floats:
-    """Return stamps (N,), s. ValueError if they are not finite, or do not increase."""
+    """Return stamps (N,), s. ValueError if they are not (N,), not finite, or do not increase."""
     stamps = np.asarray(values, dtype=np.float64)
     if stamps.ndim != 1:
         raise ValueError(f"stamps are (N,) seconds, got the shape {stamps.shape}")

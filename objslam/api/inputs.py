@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from objslam.api.array_input import as_boxes, as_poses, as_stamps, per_box
 from objslam.api.camera import as_camera
-from objslam.core import types
+from objslam.core import trajectory, types
 from objslam.core.appearance.features import MAX_FEATURES, unit_vectors
 from objslam.core.arrays import Floats32
 from objslam.core.camera import Camera
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _COLUMNS = ("stamp", "x", "y", "z", "qx", "qy", "qz", "qw")  # The columns of a table of poses, s and m.
 
 
-class Trajectory(types.Trajectory):
+class Trajectory(trajectory.Trajectory):
     """Poses of one coordinate frame in another over time. stamps: (N,) s, increasing. poses: (N, 4, 4)."""
 
     @classmethod
@@ -121,8 +121,8 @@ class Log(types.Log):
         cameras: Camera | Sequence[Camera],
         detections: types.Detections | Sequence[types.Detections],
         *,
-        odometry: tuple[ArrayLike, ArrayLike] | types.Trajectory | None = None,
-        localization: tuple[ArrayLike, ArrayLike] | types.Trajectory | None = None,
+        odometry: tuple[ArrayLike, ArrayLike] | trajectory.Trajectory | None = None,
+        localization: tuple[ArrayLike, ArrayLike] | trajectory.Trajectory | None = None,
         name: str = "log",
     ) -> Self:
         """Make a log from arrays. A path is a `Trajectory`, or the stamps and poses of `Trajectory.from_arrays`.
@@ -158,7 +158,7 @@ class Log(types.Log):
         cameras = [f"camera {c.camera.name}: {_content(c)}" for c in self.cameras]
         return f"Log {self.name!r}: {'; '.join([*paths, *cameras])}"
 
-    def _paths(self) -> dict[str, types.Trajectory | None]:
+    def _paths(self) -> dict[str, trajectory.Trajectory | None]:
         return {"odometry": self.odometry, "localisation": self.localization}
 
 
@@ -190,8 +190,8 @@ def _unit_features(features: Sequence[ArrayLike], counts: list[int]) -> Floats32
     return units
 
 
-def _path(given: tuple[ArrayLike, ArrayLike] | types.Trajectory | None, name: str) -> types.Trajectory | None:
-    if given is None or isinstance(given, types.Trajectory):
+def _path(given: tuple[ArrayLike, ArrayLike] | trajectory.Trajectory | None, name: str) -> trajectory.Trajectory | None:
+    if given is None or isinstance(given, trajectory.Trajectory):
         return given
     try:
         return Trajectory.from_arrays(*given)

@@ -42,7 +42,7 @@ RANGE_LIMIT = 3.0
 
 @dataclass(frozen=True)
 class LinesByLabel:
-    """Lines (R,) in the map, sorted by label, such that products of matrices compare them with points.
+    """Lines (R,) in the map, sorted by label. Two matrix products compare all lines of a label with points.
 
     order: (R,) the observations in this order. bounds: (L + 1,) where the lines of each label begin and end. centre: (3,) m,
     the mean of the origins. For a point p in m from the centre, (p, 1) times the column of a line in `depth` (4, R) is the

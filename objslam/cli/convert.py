@@ -13,7 +13,7 @@ from objslam.sources import SourceOptions
 @with_options
 def convert(
     source: Annotated[
-        Path, typer.Argument(metavar="SRC", help="The recording: a ROS bag, UTIAS MRCLAM, TUM RGB-D, or a log folder.")
+        Path, typer.Argument(metavar="SRC", help="The recording, such as a ROS bag. `objslam info` tells its kind.")
     ],
     log: Annotated[Path, typer.Argument(metavar="LOG", help="The log folder to write.")],
     *,

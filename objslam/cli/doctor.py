@@ -108,7 +108,7 @@ def _show_trials(found: Diagnosis) -> None:
         first, *others = found.trials
         better = " clearly" if any(trial.score > first.score for trial in others) else ""
         share = f"{100 * first.share:.0f} % of the boxes fit the log as it is"
-        say(f"{share}; {len(others)} corrections were tried, and none fits{better} better")
+        say(f"{share}; no correction fits{better} better ({len(others)} tried)")
         return
     table = Table(title="how well the boxes fit")
     for name in ("what if", "boxes that fit", "score", "drives where it heads"):

@@ -31,7 +31,10 @@ Sources = Annotated[
 OutUrl = Annotated[str, typer.Option("-o", "--out", help="Folder or URL for results, sites and tables.")]
 By = Annotated[
     str,
-    typer.Option("--by", help="What names the site of a log: a field of --layout, or `folder`. `none`: one site."),
+    typer.Option(
+        "--by",
+        help="How a log gets its site: from a field of --layout, or from its `folder`. `none`: all logs are one site.",
+    ),
 ]
 LayoutOption = Annotated[
     str, typer.Option("--layout", help="The folders above a log, as {site}/{robot}/{day}/{log}. A log is the last part.")

@@ -12,7 +12,8 @@ from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera
 from objslam.core.object_map import ObjectMap
 from objslam.core.trace import Round
-from objslam.core.types import Association, Images, Keyframes, Rays, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Association, Images, Keyframes, Rays
 
 DoubtKind = Literal["pair", "split", "unresolved", "unsure", "boxes", "label"]
 DOUBT_KINDS: tuple[DoubtKind, ...] = ("pair", "split", "unresolved", "unsure", "boxes", "label")

@@ -9,7 +9,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera
 from objslam.core.object_map import ObjectMap
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 
 NOT_USED = " not used"  # The end of a name in `Snapshot.counters`, such as "odometry not used" if the settings exclude it.
 CAME_BEFORE = " that came before"  # The end of a name in `Snapshot.counters`, for repeated data of a restarted program.

@@ -1,14 +1,38 @@
-"""Corrections of a whole path, derived from the corrections of its keyframes."""
+"""Poses over time, and corrections of a whole path, derived from the corrections of its keyframes."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Floats, need
 from objslam.core.geometry import interpolate, inverse, log_se3, twist_lengths
 from objslam.core.rotation import rotation_vector
-from objslam.core.types import Keyframes, Trajectory
 
 _SPAN = 0.4
 """The time, s, over which a speed is averaged. It spans several poses of slow odometry. A longer time smooths more."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of one coordinate frame in another over time.
+
+    stamps: (N,) s, finite, strictly increasing. poses: (N, 4, 4) homogeneous, finite. travel: (N, 3) the sum of
+    `travel` since the previous pose, over all measured poses. None if none was left out. ValueError otherwise.
+    """
+
+    stamps: Floats
+    poses: Floats
+    travel: Floats | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.stamps)
+        need(self.stamps.shape == (n,) and self.poses.shape == (n, 4, 4), "a trajectory needs (N,) stamps, (N, 4, 4) poses")
+        need(self.travel is None or self.travel.shape == (n, 3), "a trajectory needs (N, 3) travel")
+        need(np.isfinite(self.stamps).all() and np.isfinite(self.poses).all(), "the values of a trajectory must be finite")
+        need((np.diff(self.stamps) > 0).all(), "the stamps of a trajectory must increase")
+
+    def __len__(self) -> int:
+        return len(self.stamps)
 
 
 def rates(path: Trajectory, stamps: Floats) -> tuple[Floats, Floats]:
@@ -73,13 +97,3 @@ def poses_near(path: Trajectory, stamps: Floats, max_gap: float) -> Floats:
     before, after = at[index - 1], at[np.minimum(index, last)]
     nearest = np.where(known - before < after - known, before, after)
     return interpolate(at, path.poses, np.where(after - before > max_gap, nearest, known), np.inf)[0]
-
-
-def ways(keyframes: Keyframes) -> Floats:
-    """Return how far (K,) m the robot had driven at each keyframe, by the odometry where it measured the motion, else by the
-    localisation."""
-    steps = np.linalg.norm(np.diff(keyframes.map_T_base[:, :3, 3], axis=0), axis=1)
-    if keyframes.odom_T_base is not None:
-        by_odometry = np.linalg.norm(np.diff(keyframes.odom_T_base[:, :3, 3], axis=0), axis=1)
-        steps = np.where(keyframes.measured, by_odometry, steps)
-    return np.append(0.0, np.cumsum(steps))

@@ -12,44 +12,17 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from objslam.core.appearance.features import FeatureTable, are_unit_vectors
-from objslam.core.arrays import Bools, Floats, Floats32, Ints
+from objslam.core.arrays import Bools, Floats, Floats32, Ints, need
 from objslam.core.bodies.cut_boxes import CutBoxes
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.statistics import WHITE, Lasting
+from objslam.core.trajectory import Trajectory
 
 MAX_BOXES = 10_000
 """The most boxes of a frame. No detector finds more, so frames with more are rejected. A larger number may be too slow."""
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 """The axis of a map's frame that points up in the world, with its sign."""
-
-
-def _need(condition: Any, message: str) -> None:
-    if not condition:
-        raise ValueError(message)
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """Poses of one coordinate frame in another over time.
-
-    stamps: (N,) s, finite, strictly increasing. poses: (N, 4, 4) homogeneous, finite. travel: (N, 3) the sum of
-    `trajectory.travel` since the previous pose, over all measured poses. None if none was left out. ValueError otherwise.
-    """
-
-    stamps: Floats
-    poses: Floats
-    travel: Floats | None = None
-
-    def __post_init__(self) -> None:
-        n = len(self.stamps)
-        _need(self.stamps.shape == (n,) and self.poses.shape == (n, 4, 4), "a trajectory needs (N,) stamps, (N, 4, 4) poses")
-        _need(self.travel is None or self.travel.shape == (n, 3), "a trajectory needs (N, 3) travel")
-        _need(np.isfinite(self.stamps).all() and np.isfinite(self.poses).all(), "the values of a trajectory must be finite")
-        _need((np.diff(self.stamps) > 0).all(), "the stamps of a trajectory must increase")
-
-    def __len__(self) -> int:
-        return len(self.stamps)
 
 
 _BOX_COLUMNS = ("frame", "label", "scores", "depths", "track_ids")  # The fields of Detections with one number per box.
@@ -84,20 +57,18 @@ class Detections:
 
     def __post_init__(self) -> None:
         m = len(self.frame)
-        _need(self.boxes.shape == (m, 4), "boxes must be (M, 4)")
+        need(self.boxes.shape == (m, 4), "boxes must be (M, 4)")
         for name in _BOX_COLUMNS:
-            _need(getattr(self, name).shape == (m,), f"{name} must be (M,) like the boxes")
-        _need(self.corners is None or self.corners.shape == (m, 4, 2), "corners must be (M, 4, 2) like the boxes")
+            need(getattr(self, name).shape == (m,), f"{name} must be (M,) like the boxes")
+        need(self.corners is None or self.corners.shape == (m, 4, 2), "corners must be (M, 4, 2) like the boxes")
         if self.features is not None:
-            _need(self.features.ndim == 2 and len(self.features) == m, "features must be (M, D) like the boxes")
-            _need(
-                self.features.dtype == np.float32 and are_unit_vectors(self.features), "features must be unit float32 rows"
-            )
-        _need((np.diff(self.frame_stamps) > 0).all(), "the stamps of the frames must increase")
-        _need((np.diff(self.frame) >= 0).all(), "boxes must come in the order of their frames")
+            need(self.features.ndim == 2 and len(self.features) == m, "features must be (M, D) like the boxes")
+            need(self.features.dtype == np.float32 and are_unit_vectors(self.features), "features must be unit float32 rows")
+        need((np.diff(self.frame_stamps) > 0).all(), "the stamps of the frames must increase")
+        need((np.diff(self.frame) >= 0).all(), "boxes must come in the order of their frames")
         if m:
-            _need(0 <= self.frame.min() and self.frame.max() < len(self.frame_stamps), "frame must index frame_stamps")
-            _need(0 <= self.label.min() and self.label.max() < len(self.label_names), "label must index label_names")
+            need(0 <= self.frame.min() and self.frame.max() < len(self.frame_stamps), "frame must index frame_stamps")
+            need(0 <= self.label.min() and self.label.max() < len(self.label_names), "label must index label_names")
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -128,8 +99,8 @@ class Images:
     paths: tuple[Path, ...]
 
     def __post_init__(self) -> None:
-        _need(self.stamps.shape == (len(self.paths),), "images need one stamp for each path")
-        _need((np.diff(self.stamps) > 0).all(), "the stamps of images must increase")
+        need(self.stamps.shape == (len(self.paths),), "images need one stamp for each path")
+        need((np.diff(self.stamps) > 0).all(), "the stamps of images must increase")
 
 
 @dataclass(frozen=True)
@@ -208,7 +179,7 @@ class Keyframes:
     for all. It is -1 without odometry, where odom_T_base and drift have no meaning. step: (K,) the place of each keyframe
     among the steps of the odometry. wander: (K, 6) the variance of that step. Both are from `OdometryBridge.at`, and None if
     the odometry is exact between its poses. given_stamps: (K,) s, as the frames have them in the log or came from the robot,
-    None if they are `stamps`. driven: (K,) m, the `ways` before any correction, None if nothing was corrected.
+    None if they are `stamps`. driven: (K,) m, the `way` before any correction, None if nothing was corrected.
     """
 
     stamps: Floats
@@ -255,6 +226,15 @@ class Keyframes:
         if self.stretch is None or not self.localized_every:
             return np.ones(steps, dtype=bool)
         return (self.stretch[1:] == self.stretch[:-1]) & (self.stretch[1:] >= 0)
+
+    @property
+    def way(self) -> Floats:
+        """(K,) m, how far the robot had driven, by the odometry where it measured the motion, else by the localisation."""
+        steps = np.linalg.norm(np.diff(self.map_T_base[:, :3, 3], axis=0), axis=1)
+        if self.odom_T_base is not None:
+            by_odometry = np.linalg.norm(np.diff(self.odom_T_base[:, :3, 3], axis=0), axis=1)
+            steps = np.where(self.measured, by_odometry, steps)
+        return np.append(0.0, np.cumsum(steps))
 
     def take(self, keyframes: Bools | Ints) -> Self:
         """Select keyframes by a mask or by indices."""

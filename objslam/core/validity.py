@@ -163,7 +163,7 @@ def covariance_fault(covariance: Floats) -> str | None:
 def camera_fault(camera: Camera) -> str | None:
     """Return what is wrong with a camera whose fields have the right types, in words that follow "camera"; None if valid.
 
-    The pose of the camera is only checked. `rigid_pose` returns the exact pose.
+    This checks the pose of the camera, and does not correct it. `rigid_pose` does.
     """
     matrix = camera.matrix
     if (fault := _matrix_fault(matrix)) is not None:

@@ -28,7 +28,7 @@ class Candidates:
 def decode(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
     """Decode and filter the boxes of one image. They are x1, y1, x2, y2 in px of the input, the highest score first. A label
     is an index into the names, or a class number if there are no names. The outputs have no batch axis. Raises DetectorError
-    if a score is above 1, a class has no name, or a class number is impossible."""
+    if a score is clearly above 1, a class has no name, or a class number is impossible."""
     found = _DECODERS[recipe.layout](recipe, outputs, width, height)
     boxes, scores = _corners(recipe, found.boxes, width, height), found.scores
     if len(scores) and scores.max() > 1.001:

@@ -1,6 +1,6 @@
 """The covariances of a map after its alignment with the truth.
 
-The alignment takes out the errors that all objects share, as far as it can follow them, and spreads a little of each
+The alignment takes out the part of the shared errors that a transform can express, and spreads a little of each
 object's own error over all others. The remaining errors have another covariance than the map gives. The squared Mahalanobis
 distances after an alignment must use this covariance. Only then do they show whether the covariances of the map are right.
 """

@@ -10,7 +10,8 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import align, inverse, lift_se2, make_pose
 from objslam.core.object_map import MapObject, ObjectMap
-from objslam.core.types import Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Truth, TruthObject
 
 Alignment = Literal["none", "se2", "sim2", "se3", "sim3"]
 """The alignment of a map with the truth: none, se2 (yaw and translation), se3 (rotation and translation), and sim2 and sim3,

@@ -9,7 +9,8 @@ from objslam.core.arrays import Floats
 from objslam.core.geometry import align as align_points
 from objslam.core.geometry import interpolate, quaternion
 from objslam.core.object_map import MapObject, ObjectMap
-from objslam.core.types import Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Truth, TruthObject
 from objslam.errors import ConfigError, LogError
 from objslam.evaluation.aligned_covariances import aligned_covariances
 from objslam.evaluation.alignment import IDENTITY, Alignment, Transform, align_objects, correspondences, match_points

@@ -10,7 +10,8 @@ from objslam.core.arrays import Floats
 from objslam.core.calibration import AXES, LENS
 from objslam.core.geometry import lengths, make_pose
 from objslam.core.rotation import rotation_from_vector
-from objslam.core.types import CameraLog, Images, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Images, Log
 from objslam.frontend.corrected_odometry import corrected_odometry
 from objslam.frontend.surface_ranges import corrected_ranges
 

@@ -10,7 +10,7 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import lengths, motion_between
 from objslam.core.rotation import rotation_vector
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.frontend.odometry_bridge import OdometryBridge, bridge_of
 from objslam.frontend.odometry_drift import DriftPath, PlanarSteps
 from objslam.frontend.recent_values import RecentValues

@@ -9,7 +9,8 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import in_view
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import evenly_spread, interpolate, inverse
-from objslam.core.types import Keyframes, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Keyframes, Log
 from objslam.errors import LogError
 from objslam.frontend.localization.measured_poses import with_measurements
 from objslam.frontend.odometry_bridge import bridge_of

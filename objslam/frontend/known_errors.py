@@ -12,7 +12,8 @@ from objslam.core.arrays import Floats
 from objslam.core.calibration import AXES, LENS, Calibration, kind
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import is_planar
-from objslam.core.types import Keyframes, Log, Rays, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Keyframes, Log, Rays
 from objslam.errors import ConfigError
 from objslam.frontend.corrected_log import take_out
 from objslam.frontend.corrected_odometry import ODOMETRY, CorrectablePath

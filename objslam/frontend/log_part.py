@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats
-from objslam.core.types import CameraLog, Detections, Images, Log, Trajectory, Truth
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Images, Log, Truth
 from objslam.errors import LogError
 
 

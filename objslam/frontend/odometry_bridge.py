@@ -13,8 +13,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.geometry import inverse, log_se3
-from objslam.core.trajectory import usual_seconds
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory, usual_seconds
 from objslam.frontend.recent_values import ValuesOfObjects
 
 _SHARED = 1.0

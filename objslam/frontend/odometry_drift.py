@@ -9,7 +9,7 @@ import numpy as np
 from objslam.config import Odometry, Settings
 from objslam.core.arrays import Floats
 from objslam.core.geometry import adjoint, inverse, twist_length, twist_lengths
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 
 Length = TypeVar("Length", float, Floats)
 

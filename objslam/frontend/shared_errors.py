@@ -12,8 +12,8 @@ from objslam.core.arrays import Floats
 from objslam.core.calibration import MOST_SCALE, SCALES, Calibration, kind
 from objslam.core.geometry import inverse
 from objslam.core.noise import NOMINAL, NoiseFactors
-from objslam.core.trajectory import poses_near, ways
-from objslam.core.types import Keyframes, Log, Rays, Trajectory
+from objslam.core.trajectory import Trajectory, poses_near
+from objslam.core.types import Keyframes, Log, Rays
 from objslam.frontend.corrected_log import corrected_mount, inverse_lens, later, lens_errors, refocused, take_out
 from objslam.frontend.corrected_odometry import ODOMETRY, CorrectablePath
 from objslam.frontend.corrected_rays import corrected_poses, corrected_rays
@@ -196,7 +196,7 @@ class SharedErrors:
         if self.settings.mode == "joint":
             noise = self.noise
             moved = replace(moved, pose_noise=(noise.heading, noise.place), lasting=noise.lasting)
-            moved = replace(moved, driven=ways(self.keyframes))
+            moved = replace(moved, driven=self.keyframes.way)
         return moved, ranged, settings if tags is settings.tags else settings.model_copy(update={"tags": tags})
 
     def rays_in_map(self, values: Floats) -> tuple[Floats, Floats, Floats]:

@@ -8,7 +8,8 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.calibration import kind
 from objslam.core.geometry import angles_off
-from objslam.core.types import Keyframes, Rays, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
 
 _STEP = 0.02

@@ -10,7 +10,7 @@ import numpy as np
 
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import pose_from_quaternion, quaternion
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.core.validity import lengths, valid_pose_rows, valid_positions, valid_stamps
 from objslam.errors import LogError
 from objslam.io.text import Table, in_order, parse_numbers, read_lines, require_order, select, to_table

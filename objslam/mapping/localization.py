@@ -15,7 +15,8 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import split_se2
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.trace import Round
-from objslam.core.types import Log, Trajectory, Up
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log, Up
 from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.up import on_its_side, up_axis

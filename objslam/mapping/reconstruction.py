@@ -20,7 +20,8 @@ from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, inverse
 from objslam.core.result import Surface
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.errors import LogError
 from objslam.frontend.box_depths import MAX_IMAGE_LAG, nearest_stamps, read_depth
 from objslam.io.images import decode_colour
@@ -137,7 +138,7 @@ def _fuse(
             return None
         if grid.left_out:
             ledger.warn(
-                f"the reconstruction is not whole: {grid.left_out} blocks, counted for each image, are beyond its limit "
+                f"the reconstruction is not whole: {grid.left_out} blocks did not fit. A block counts once for each image "
                 "(raise reconstruction.max_blocks or reconstruction.voxel)"
             )
         surface = grid.surface(chosen.min_views)

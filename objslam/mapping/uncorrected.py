@@ -4,7 +4,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.geometry import angles_off, interpolate, inverse
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.solution import Solution
 

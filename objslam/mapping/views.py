@@ -7,7 +7,8 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate
-from objslam.core.types import Keyframes, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Keyframes, Log
 from objslam.frontend.keyframes import build_keyframes
 
 

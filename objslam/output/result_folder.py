@@ -12,8 +12,8 @@ import numpy as np
 
 from objslam.config import dump_settings
 from objslam.core.result import RunResult
-from objslam.core.trajectory import rates
-from objslam.core.types import CameraLog, Trajectory, Truth
+from objslam.core.trajectory import Trajectory, rates
+from objslam.core.types import CameraLog, Truth
 from objslam.errors import OutputError
 from objslam.evaluation.alignment import lay_truth
 from objslam.io.atomic_files import FileSet, disk_errors, encode, is_cut_short, is_locked, replace_files, try_folder

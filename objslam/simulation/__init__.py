@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from objslam.core.geometry import lift_se2
-from objslam.core.types import CameraLog, Log, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Log, Truth, TruthObject
 from objslam.simulation.detector import Boxes, detect, detections, imagine, order_of, views, with_features
 from objslam.simulation.scene import furnish, roam
 from objslam.simulation.settings import (

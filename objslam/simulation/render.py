@@ -15,7 +15,8 @@ from objslam.config import NotNegative, Positive, Section
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.geometry import lift_se2, widest_angle
-from objslam.core.types import CameraLog, Detections, Images, Log, Trajectory, Truth, TruthObject, label_table
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Images, Log, Truth, TruthObject, label_table
 from objslam.errors import ConfigError
 from objslam.simulation.furniture import Room, furnish_room, object_sizes
 from objslam.simulation.raycast import Cast, Caster

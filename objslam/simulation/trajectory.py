@@ -8,7 +8,7 @@ import numpy as np
 from objslam import config
 from objslam.core.arrays import Floats
 from objslam.core.geometry import inverse, lift_se2, split_se2
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.simulation.settings import DriveSettings, PoseNoise
 
 START = 1_700_000_000.0  # The stamp of the start of every drive, s.

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import CameraLog, Images, Log, Trajectory, Truth
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Images, Log, Truth
 from objslam.errors import LogError, OutputError
 from objslam.io.camera_yaml import read_camera, write_camera, write_mounts
 from objslam.io.detections_jsonl import read_detections, write_detections

@@ -8,7 +8,8 @@ from objslam.errors import LogError
 
 if TYPE_CHECKING:
     from objslam.core.arrays import Floats
-    from objslam.core.types import CameraLog, Trajectory
+    from objslam.core.trajectory import Trajectory
+    from objslam.core.types import CameraLog
 
 
 class NoCamera(LogError):

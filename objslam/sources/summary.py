@@ -8,7 +8,8 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera, spoken_name
 from objslam.core.statistics import RAYLEIGH_MEDIAN
-from objslam.core.types import Detections, Images, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Detections, Images, Log
 from objslam.frontend.log_part import part_in_words
 
 FIND_BOXES = "run a detector on its images (--detector)"  # The advice for a camera with images but without detections.
@@ -132,9 +133,9 @@ def path_length(positions: Floats) -> float:
     """Return the length of a path, m, without the steps of its noise.
 
     A chord goes from a position to the next one that is `_STEP` sigmas of the noise away. The noise along a path cancels
-    from chord to chord. The noise across the path makes a chord longer by the share (sigma / length)^2, 1 %. positions: (N,
-    3), m. The noise is measured from the second differences of the positions: white noise is large there, and motion is
-    small.
+    from chord to chord. The noise across the path makes a chord longer by (sigma / length)^2, which is at most 1 %.
+    The noise is measured from the second differences of the positions: white noise is large there, and motion is small.
+    positions: (N, 3), m.
     """
     bends = np.linalg.norm(np.diff(positions, n=2, axis=0), axis=1)
     sigma = float(np.median(bends)) / (RAYLEIGH_MEDIAN * np.sqrt(6.0)) if len(bends) else 0.0

@@ -45,11 +45,13 @@ def approach(lines: LineBlock) -> tuple[Tensor, int]:
 
 
 def newton(lines: LineBlock, start: Tensor, steps: int = _STEPS) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Take at most `steps` Newton steps from the start (3, B). A step that does not lower the cost enough is shortened.
+    """Take Newton steps from the start (3, B). A step that does not lower the cost enough is shortened.
+
+    steps: the most evaluations of the cost, with those of the start and of shortened steps.
 
     Returns:
-        The points (3, B), the gradient norms (B,), which objects are solved up to rounding (B,), and the number of steps. An
-        unsolved object may have a line through or near its solution, or no curvature.
+        The points (3, B), the gradient norms (B,), which objects are solved up to rounding (B,), and the number of
+        evaluations. An unsolved object may have a line through or near its solution, or no curvature.
     """
     xp = lines.xp
     epsilon = _SINGLE if start.dtype == xp.float32 else _DOUBLE

@@ -23,7 +23,7 @@ from objslam.core.bodies.tag_pose import TagPose
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.snapshot import TOO_SLOW, Snapshot
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.frontend.bearings import CUT_OFF
 
 EMPTY = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))

@@ -19,7 +19,8 @@ from objslam.config import Detector as DetectorSettings
 from objslam.config import Settings
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import CameraLog, Images, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Images, Log
 from objslam.detection import default_cache, detect_log, load_detector
 from objslam.detection.detector import Detector
 from objslam.errors import DetectorError, LogError

@@ -8,7 +8,8 @@ from tiny_models import COLOURS, scene, tiny_model
 
 from objslam.core.camera import Camera
 from objslam.core.geometry import lift_se2, make_pose
-from objslam.core.types import CameraLog, Images, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Images, Log
 from objslam.io.results.read import load_map
 from objslam.sources.log_folder import write_log_folder
 

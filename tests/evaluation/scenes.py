@@ -9,7 +9,8 @@ from rich.console import Console
 from objslam.core.arrays import Floats
 from objslam.core.geometry import lift_se2
 from objslam.core.object_map import MapObject, ObjectMap
-from objslam.core.types import Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Truth, TruthObject
 from objslam.evaluation.evaluate import Evaluation
 from objslam.evaluation.table import evaluation_table
 

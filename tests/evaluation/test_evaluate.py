@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 from objslam.core.arrays import Floats
 from objslam.core.geometry import lift_se2
 from objslam.core.object_map import ObjectMap
-from objslam.core.types import Trajectory, Truth
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Truth
 from objslam.errors import ConfigError, LogError
 from objslam.evaluation.alignment import match_points
 from objslam.evaluation.evaluate import evaluate

@@ -17,7 +17,7 @@ from synthetic_result import clusters, synthetic_result
 from objslam.config import Output, Settings, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import make_pose
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.errors import LogError
 from objslam.evaluation.evaluate_folder import choose_alignment, evaluate_folder, write_evaluation
 from objslam.evaluation.table import evaluation_table

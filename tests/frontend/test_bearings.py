@@ -13,7 +13,8 @@ from objslam.config import Settings
 from objslam.core.camera import Camera, undistort
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import angles_off
-from objslam.core.types import CameraLog, Detections, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 

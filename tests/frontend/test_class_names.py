@@ -8,7 +8,8 @@ import pytest
 from objslam.core.camera import Camera
 from objslam.core.coco import COCO_NAMES
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log, Truth, TruthObject
 from objslam.errors import ConfigError
 from objslam.frontend.class_names import load_names, with_names
 

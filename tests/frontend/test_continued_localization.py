@@ -9,7 +9,8 @@ from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, lift_se2
 from objslam.core.statistics import Lasting
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.localization.continued_localization import (
     bridged,

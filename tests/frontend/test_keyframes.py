@@ -13,8 +13,8 @@ from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import adjoint, exp_se3, interpolate, inverse, lift_se2, log_se3, make_pose
 from objslam.core.rotation import rotation_from_vector
-from objslam.core.trajectory import correct_path
-from objslam.core.types import CameraLog, Detections, Log, Trajectory
+from objslam.core.trajectory import Trajectory, correct_path
+from objslam.core.types import CameraLog, Detections, Log
 from objslam.errors import LogError
 from objslam.frontend.corrected_odometry import ODOMETRY, CorrectablePath, corrected_odometry
 from objslam.frontend.keyframes import build_keyframes

@@ -10,8 +10,8 @@ from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2, make_pose
 from objslam.core.rotation import rotation_from_vector
-from objslam.core.trajectory import travel
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory, travel
+from objslam.core.types import Log
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.corrected_odometry import CorrectablePath, corrected_odometry
 from objslam.frontend.known_errors import possible

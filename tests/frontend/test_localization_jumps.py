@@ -10,7 +10,8 @@ import pytest
 from objslam.config import load_settings
 from objslam.core.geometry import lift_se2
 from objslam.core.rotation import rotation_from_vector
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.frontend.localization.localization_jumps import Jumps, find_jumps
 
 SETTINGS = load_settings(None, ())

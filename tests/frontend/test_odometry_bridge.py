@@ -6,7 +6,7 @@ from scipy.signal import lfilter
 
 from objslam.config import Odometry
 from objslam.core.geometry import interpolate, inverse, lift_se2, log_se3
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.frontend.odometry_bridge import OdometryBridge
 
 FINE = 20  # True poses in a step.

@@ -10,7 +10,8 @@ import pytest
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, inverse, lift_se2
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.frontend.localization.odometry_clock import OdometryClock, at_one_clock, clock_of_odometry
 
 SECONDS = 300.0

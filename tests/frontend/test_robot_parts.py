@@ -15,7 +15,8 @@ from objslam.config import load_settings
 from objslam.core.camera import Camera, project, undistort
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, inverse, lift_se2, make_pose
-from objslam.core.types import CameraLog, Detections, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.boxes.part_finder import RobotPartFinder
 from objslam.frontend.boxes.robot_parts import ROBOT_PARTS, without_robot_parts

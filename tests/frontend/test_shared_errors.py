@@ -13,8 +13,8 @@ from objslam.config import load_settings
 from objslam.core.calibration import Calibration
 from objslam.core.diagnostics import Ledger
 from objslam.core.noise import NoiseFactors
-from objslam.core.trajectory import correct_poses
-from objslam.core.types import Images, Trajectory
+from objslam.core.trajectory import Trajectory, correct_poses
+from objslam.core.types import Images
 from objslam.errors import ConfigError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.corrected_log import refocused, take_out

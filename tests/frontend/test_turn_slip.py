@@ -6,8 +6,8 @@ from added_errors import add_shared_errors
 from numpy.testing import assert_allclose
 
 from objslam.core.geometry import lift_se2
-from objslam.core.trajectory import travel
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory, travel
+from objslam.core.types import Log
 from objslam.frontend.corrected_odometry import OdometryCorrection, corrected_odometry
 
 SLIP = {"odometry.turn_slip": 0.08}

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from turning_drive import drive, errors_of
 
 from objslam.core.geometry import inverse, make_pose
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.turning_clocks import clocks_of_turns
 

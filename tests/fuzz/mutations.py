@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.errors import ObjslamError
 
 ROUNDS = int(os.environ.get("OBJSLAM_FUZZ_ROUNDS", "1"))

@@ -13,18 +13,8 @@ from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.geometry import align, angles_off, interpolate, lift_se2
-from objslam.core.types import (
-    Association,
-    Camera,
-    CameraLog,
-    Detections,
-    Keyframes,
-    Log,
-    Rays,
-    Trajectory,
-    Truth,
-    TruthObject,
-)
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Association, Camera, CameraLog, Detections, Keyframes, Log, Rays, Truth, TruthObject
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.graph.batch_solver import solve_fixed, solve_joint

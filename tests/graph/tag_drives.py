@@ -10,7 +10,8 @@ from objslam.config import Settings, load_settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera, project
 from objslam.core.geometry import align, exp_se3, inverse, lift_se2, make_pose
-from objslam.core.types import CameraLog, Detections, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log
 
 BASE_T_CAMERA = make_pose(np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]]), np.array([0.1, 0.0, 0.5]))  # It looks outwards.
 SQUARE = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])

@@ -16,7 +16,8 @@ from objslam.core.calibration import Calibration
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
 from objslam.core.rotation import rotation_from_vector
-from objslam.core.types import Association, CameraLog, Detections, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Association, CameraLog, Detections, Log
 from objslam.errors import SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes

@@ -9,7 +9,8 @@ from numpy.testing import assert_allclose
 
 from objslam.config import Odometry, Settings, load_settings
 from objslam.core.geometry import exp_se3, lift_se2
-from objslam.core.types import Keyframes, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Keyframes
 from objslam.graph.assembly import Measurements
 from objslam.graph.factors.odometry import motions
 from objslam.graph.factors.odometry_motions import OdometryMotions, find_ties

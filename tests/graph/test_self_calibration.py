@@ -13,7 +13,7 @@ from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse
 from objslam.core.noise import NoiseFactors
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.frontend.known_errors import shared_errors
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.graph.assembly import Measurements

@@ -14,7 +14,8 @@ import pytest
 from objslam.api.inputs import Detections
 from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import CameraLog, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Log
 from objslam.errors import OutputError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes

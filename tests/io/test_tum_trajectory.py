@@ -9,7 +9,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.errors import LogError
 from objslam.io.tum_trajectory import read_trajectory, write_trajectory
 

@@ -15,7 +15,8 @@ from objslam.core.calibration import Calibration
 from objslam.core.geometry import lift_se2, make_pose
 from objslam.core.noise import NOMINAL
 from objslam.core.rotation import rotation_from_vector, rotation_vector
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.frontend.corrected_odometry import OdometryCorrection
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.io.calibration_yaml import dump_calibration

@@ -11,7 +11,7 @@ from waiting import LIMIT
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, inverse, lift_se2
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.live.adapters.replay import events
 from objslam.live.session.session import Session
 from objslam.mapping.localization import PriorMap, moved_log

@@ -8,7 +8,7 @@ import pytest
 from driving import feed
 
 from objslam.config import Odometry, load_settings
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.evaluation.evaluate import evaluate
 from objslam.live.session import map_scale
 from objslam.live.session.map_scale import scale_covariances, scale_sigma

@@ -14,7 +14,7 @@ from waiting import LIMIT
 
 from objslam.config import load_settings
 from objslam.core.geometry import lift_se2
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.io.results.read import load_map
 from objslam.live.session.session import Session
 from objslam.simulation import PoseNoise

@@ -14,7 +14,7 @@ from objslam.association.refinement import information, normalised_residuals
 from objslam.association.single_object_fit import fit_point
 from objslam.config import Odometry, Settings, Triangulation, load_settings
 from objslam.core.geometry import exp_se3, interpolate, inverse, lift_se2
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.frontend.odometry_drift import gathered_drift
 from objslam.live.mapper.course import Course
 from objslam.live.mapper.keyframe_selection import KeyframeSelector

@@ -8,8 +8,7 @@ from test_session import make_log
 
 from objslam.config import Odometry, load_settings
 from objslam.core.geometry import exp_se3, interpolate, lift_se2
-from objslam.core.trajectory import travel
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory, travel
 from objslam.frontend.corrected_odometry import corrected_odometry
 from objslam.frontend.odometry_drift import gathered_drift
 from objslam.live.mapper import tables

@@ -16,7 +16,7 @@ from waiting import LIMIT, wait_for
 
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.snapshot import Snapshot
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.ros.bag.records import Connection
 from objslam.ros.messages.decode import make_decoder
 

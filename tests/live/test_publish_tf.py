@@ -15,7 +15,7 @@ from objslam.config import load_settings
 from objslam.core.geometry import interpolate, inverse, lift_se2
 from objslam.core.object_map import ObjectMap
 from objslam.core.snapshot import Snapshot
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.live.adapters.replay import events
 from objslam.live.ros.message_handler import RosMessages
 from objslam.live.session.session import Session

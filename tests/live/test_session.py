@@ -17,7 +17,7 @@ from objslam.config import Odometry, load_settings
 from objslam.core.camera import project
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import align, inverse, lift_se2
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.errors import SolveError
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays

@@ -7,7 +7,7 @@ from objslam.config import load_settings
 from objslam.core.camera import Camera
 from objslam.core.object_map import ObjectMap
 from objslam.core.snapshot import Snapshot
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.live.counters import Counters
 from objslam.live.dds.publisher import TOPICS, messages_of
 from objslam.live.session.intake import Intake

@@ -9,7 +9,8 @@ from objslam.config import load_settings
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2
-from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log, Truth, TruthObject
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
 from objslam.triangulation.bodies.ellipsoid import half_axes, heading

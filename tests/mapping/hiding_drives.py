@@ -14,7 +14,8 @@ from mapping.body_drives import FORWARD, drifting_odometry
 
 from objslam.core.camera import Camera
 from objslam.core.geometry import lift_se2
-from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log, Truth, TruthObject
 
 CAMERA = Camera("front", 640, 480, np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]]), base_T_camera=FORWARD)
 LEAST_SHOWN = 0.3

@@ -9,7 +9,8 @@ from mapping.body_drives import FORWARD, drifting_odometry
 from mapping.hiding_drives import CAMERA, Solid, image_of, long_yaw
 
 from objslam.core.geometry import inverse, lift_se2
-from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log, Truth, TruthObject
 from objslam.frontend.box_depths import box_depth
 
 SHAPES = ("cuboid", "cylinder", "ellipsoid", "sign")

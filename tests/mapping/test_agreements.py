@@ -6,7 +6,8 @@ import numpy as np
 
 from objslam.config import load_settings
 from objslam.core.geometry import lift_se2, make_pose
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.mapping.checks.agreement import Agreement, agreement, agreements, bounded_part
 from objslam.mapping.checks.hypotheses.every import hypotheses, later
 from objslam.simulation import preset, simulate

@@ -10,7 +10,8 @@ from scipy.stats import chi2
 from objslam.config import load_settings
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import CameraLog, Detections, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log
 from objslam.mapping import pipeline
 
 CAMERA = Camera("front", 640, 480, np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]))

@@ -16,7 +16,8 @@ from wrong_inputs import MISTAKES, join
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.errors import LogError
 from objslam.mapping import pipeline
 from objslam.mapping.checks.agreement import agreement, bounded_part

@@ -12,7 +12,8 @@ from objslam.core.camera import project
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2
 from objslam.core.noise import NoiseFactors
-from objslam.core.types import CameraLog, Detections, Keyframes, Log, Rays, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Keyframes, Log, Rays, Truth, TruthObject
 from objslam.errors import SolveError
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays

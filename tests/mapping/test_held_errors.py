@@ -15,7 +15,8 @@ from objslam.config import Odometry, load_settings
 from objslam.core.calibration import Calibration
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.errors import SolveError
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays

@@ -9,7 +9,8 @@ import pytest
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2
-from objslam.core.types import Association, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Association
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes

@@ -7,7 +7,8 @@ import pytest
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.errors import SolveError
 from objslam.mapping import pipeline
 from objslam.mapping.checks.stamps import check_stamps

@@ -9,7 +9,8 @@ import pytest
 
 from objslam.config import load_settings
 from objslam.core.geometry import inverse, lift_se2
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.frontend.localization.localization_jumps import find_jumps
 from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.mapping.checks.path import check_path

@@ -15,7 +15,8 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3, interpolate, inverse, lift_se2
 from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
-from objslam.core.types import Association, CameraLog, Detections, Log, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Association, CameraLog, Detections, Log, Truth, TruthObject
 from objslam.errors import LogError, SolveError
 from objslam.frontend.boxes.nested_boxes import PARTS
 from objslam.mapping import pipeline

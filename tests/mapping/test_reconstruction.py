@@ -18,7 +18,8 @@ from objslam.core.camera import Camera, undistort
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3, inverse, make_pose
 from objslam.core.result import Surface
-from objslam.core.types import CameraLog, Images, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Images, Log
 from objslam.io.detections_jsonl import read_detections
 from objslam.io.ply import write_cloud, write_mesh
 from objslam.mapping import pipeline

@@ -8,7 +8,8 @@ import pytest
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
-from objslam.core.types import CameraLog, Detections, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log
 from objslam.mapping import pipeline
 from objslam.simulation import make_camera
 

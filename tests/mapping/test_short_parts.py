@@ -10,7 +10,8 @@ from small_log import small_log
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.errors import LogError, SolveError
 from objslam.frontend.log_part import part_of_log
 from objslam.mapping import pipeline

@@ -11,7 +11,8 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera, project
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2, make_pose
-from objslam.core.types import Association, CameraLog, Detections, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Association, CameraLog, Detections, Log
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import shared_errors

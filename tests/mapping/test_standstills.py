@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import CameraLog, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Log
 from objslam.mapping.checks.diagnosis import diagnose
 from objslam.mapping.checks.hypotheses.hypothesis import with_cameras
 from objslam.mapping.standstills import repeated_views

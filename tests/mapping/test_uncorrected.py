@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
-from objslam.core.trajectory import rates
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory, rates
 from objslam.mapping import pipeline
 from objslam.simulation import preset, simulate
 

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera, project
 from objslam.core.geometry import inverse, lift_se2
-from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log, Truth, TruthObject
 from objslam.simulation.settings import make_camera
 
 FOCAL = 300.0

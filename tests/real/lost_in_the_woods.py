@@ -12,7 +12,8 @@ from scipy.io import loadmat
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.geometry import lift_se2
-from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log, Truth, TruthObject
 from objslam.simulation import make_camera
 from objslam.sources.mrclam.reader import integrate
 

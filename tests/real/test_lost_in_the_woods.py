@@ -10,7 +10,8 @@ from lost_in_the_woods import read_lost_in_the_woods
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
-from objslam.core.types import Detections, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Detections
 from objslam.evaluation.evaluate import INSIDE_95, evaluate
 from objslam.mapping import pipeline
 from objslam.mapping.checks.diagnosis import diagnose

@@ -14,7 +14,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import align
 from objslam.core.maps.shared_covariance import jacobian
 from objslam.core.object_map import ObjectMap
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
 from objslam.mapping.sites.merge import merge_sessions

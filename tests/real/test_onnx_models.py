@@ -8,7 +8,8 @@ from objslam.config import Detector as Settings
 from objslam.config import Settings as AllSettings
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import CameraLog, Images, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Images, Log
 from objslam.detection import detect_log, load_detector
 
 CONTENT = {"dog.jpg": {"dog", "bicycle", "car"}, "person.jpg": {"person", "dog", "horse"}}

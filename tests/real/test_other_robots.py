@@ -7,7 +7,7 @@ from other_robots import read_with_other_robots
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
 

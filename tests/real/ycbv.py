@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from objslam.core.arrays import Bools, Floats
 from objslam.core.camera import Camera
-from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log, Truth, TruthObject
 
 RUNS = (
     ("cracker_box", "0001"),

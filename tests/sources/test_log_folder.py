@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
-from objslam.core.types import CameraLog, Detections, Images, Log, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Images, Log, Truth, TruthObject
 from objslam.errors import LogError, OutputError
 from objslam.io import folders
 from objslam.io.objects_json import read_truth_objects

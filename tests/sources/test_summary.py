@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from objslam.core.types import Images, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Images
 from objslam.simulation import preset, simulate
 from objslam.sources.summary import contents, path_length, timing
 

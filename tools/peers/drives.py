@@ -14,7 +14,8 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2, split_se2
-from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log, Truth, TruthObject
 from objslam.simulation import make_camera
 from objslam.sources import SourceOptions, read
 from objslam.sources.mrclam.reader import integrate

@@ -9,7 +9,8 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import lift_se2
-from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log, Truth, TruthObject
 from objslam.simulation import make_camera
 
 _BLOCK, _STEP = 100.0, 8.0

@@ -2,7 +2,7 @@
 
 A wrong tilt or size moves a far object by more than a near one. So a transform alone may match the objects of a row to the
 neighbours of their true partners. Here, tilt and size are estimated together with the transform. The shared covariances of
-the maps are their priors. Tilt and size cannot move each object to another side, as independent errors of objects could.
+the maps are their priors. A tilt and a size cannot move each object its own way. Independent errors of objects could.
 """
 
 import numpy as np

@@ -49,10 +49,10 @@ class Problem:
     def chance(self, moved: Floats, index: Ints, covariance: Floats, limits: tuple[float, ...]) -> Floats:
         """Return the probability (L, H, P) that an object of a, moved to (H, P, 3), has a match in b by chance.
 
-        limits: L limits of the squared Mahalanobis distance of a match. The local density of objects with the label is the
-        larger one of two: the density of all objects times the share of the label, and the density of this label alone.
-        Equal objects often stand in groups, such as chairs at a table. If one of them has a match by chance, others of its
-        group have too.
+        H hypotheses each move P objects. limits: L limits of the squared Mahalanobis distance of a match. The local density
+        of objects with the label is the larger one of two: the density of all objects times the share of the label, and the
+        density of this label alone. Equal objects often stand in groups, such as chairs at a table. If one of them has a
+        match by chance, others of its group have too.
         """
         label = self.a.label[index]
         everything, alike = moved[..., :2], np.concatenate([moved[..., :2], label[..., None] * self.apart], axis=-1)

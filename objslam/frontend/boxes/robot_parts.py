@@ -15,7 +15,8 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, spoken_name, undistort
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate
-from objslam.core.types import CameraLog, Detections, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log
 
 ROBOT_PARTS = "boxes that stay at one place of the image while the camera turns (a part of the robot; rays.robot_parts)"
 """The reason to drop such boxes."""

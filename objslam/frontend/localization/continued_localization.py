@@ -12,7 +12,8 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import interpolate, inverse
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.frontend.odometry_drift import gathered_drift
 
 _DRIFT = 0.15

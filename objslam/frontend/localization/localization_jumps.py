@@ -15,8 +15,8 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import interpolate, is_planar, lengths
 from objslam.core.rotation import cross, rotation_from_vector, rotation_vector
 from objslam.core.statistics import NORMAL_MEDIAN
-from objslam.core.trajectory import usual_seconds
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory, usual_seconds
+from objslam.core.types import Log
 
 ANOTHER_MAP = 1.0
 """The longest jump (m) that is corrected. With a longer one, the localisation may have changed to another map, or somebody

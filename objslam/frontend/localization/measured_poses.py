@@ -15,8 +15,8 @@ from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats
 from objslam.core.geometry import adjoint, interpolate, inverse
 from objslam.core.rotation import rotation_vector
-from objslam.core.trajectory import poses_near
-from objslam.core.types import Keyframes, Log, Trajectory
+from objslam.core.trajectory import Trajectory, poses_near
+from objslam.core.types import Keyframes, Log
 from objslam.frontend.localization.continued_localization import beside, bridged
 from objslam.frontend.odometry_drift import gathered_drift
 

@@ -16,7 +16,8 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, inverse, lengths, log_se3
 from objslam.core.rotation import rotation_vector
 from objslam.core.statistics import HUBER_K, NORMAL_MEDIAN
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.frontend.localization.localization_jumps import STILL, steps_of
 
 _TRIED = 0.04

@@ -58,7 +58,7 @@ class NextStep:
         """Return the shared errors after the step, with their covariance.
 
         A held error bends the path, so it correlates the residuals, and its effect on the odometry looks like noise. So the
-        step takes the residuals for white noise. Otherwise the step would be only a third as long. The covariance is also
+        step treats the residuals as white noise. Otherwise the step would be only a third as long. The covariance is also
         that of white noise. SolveError if the linear system is not finite.
         """
         step, covariance = self._step(self._without_shrinking())

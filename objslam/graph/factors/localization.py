@@ -18,7 +18,6 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import adjoint, inverse, is_planar
 from objslam.core.ground.flattening import noise_of_ground
 from objslam.core.statistics import Lasting
-from objslam.core.trajectory import ways
 from objslam.core.types import Keyframes
 from objslam.graph.factors.noise import huber
 from objslam.graph.variables import X0
@@ -134,7 +133,7 @@ def _way(keyframes: Keyframes, number: Ints) -> Floats:
     motions that they weigh: motions that seem short would count for more, and make the map too small. Distances that
     follow the odometry's scale would make a larger map fit better.
     """
-    driven = ways(keyframes) if keyframes.driven is None else keyframes.driven
+    driven = keyframes.way if keyframes.driven is None else keyframes.driven
     return np.diff(driven[number])
 
 
@@ -195,8 +194,10 @@ def _chains(keyframes: Keyframes, settings: Settings) -> list[tuple[Floats, Floa
     return [chain(gaps, nominal * factor, lasting, added) for nominal, factor, lasting, added in columns]
 
 
-def chain(gaps: Floats, sigma: float, lasting: Lasting, more: Parts = 0.0) -> tuple[Floats, Floats]:
-    """Return the standard deviations (K,) of errors, and (K-1,) of their differences, as independent terms.
+def chain(gaps: Floats, sigma: float, lasting: Lasting, more: Floats | float = 0.0) -> tuple[Floats, Floats]:
+    """Replace correlated errors by independent terms. Return the standard deviations of these terms.
+
+    Some terms are on single errors (K,), the others on the differences of neighbours (K-1,).
 
     The terms are exact if the whole error lasts, or if nothing of it lasts. An error with both parts has no exact terms. Its
     terms have the true information about constant errors, and about errors that change their sign from pose to pose. At the

@@ -9,7 +9,8 @@ from pydantic import BaseModel
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
 from objslam.core.result import Doubt
-from objslam.core.types import Trajectory, Truth, Up
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Truth, Up
 from objslam.errors import LogError, OutputError
 from objslam.io.atomic_files import has_staging
 from objslam.io.objects_json import read_objects, read_truth_objects

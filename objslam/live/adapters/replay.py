@@ -10,7 +10,8 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import Detections, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Detections, Log
 from objslam.live.interface import Sink
 
 _BEHIND = 1.0  # The delay of a replay, s, above which the user is warned. A larger value warns later.

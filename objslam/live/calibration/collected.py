@@ -7,7 +7,8 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.noise import range_noise
 from objslam.core.statistics import WHITE
-from objslam.core.types import Association, CameraLog, Keyframes, Log, Rays, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Association, CameraLog, Keyframes, Log, Rays
 from objslam.errors import ObjslamError
 from objslam.frontend.boxes.robot_parts import ROBOT_PARTS
 from objslam.frontend.boxes.second_labels import SECOND_LABELS

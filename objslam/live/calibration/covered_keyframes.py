@@ -6,7 +6,8 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import interpolate, inverse
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.frontend.localization.continued_localization import continued_by_odometry
 from objslam.live.mapper.state import MapState
 

@@ -12,7 +12,7 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.geometry import adjoint, interpolate, inverse
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.frontend.corrected_odometry import OdometryCorrection
 from objslam.frontend.odometry_drift import gathered_drift
 from objslam.graph.factors.odometry import UNKNOWN_TURN, UNKNOWN_WAY

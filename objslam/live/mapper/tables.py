@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.trajectory import travel
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory, travel
 
 _MOST_POSES = 65_536
 """The number of poses of a path above which some are dropped: 5 minutes at 200 Hz, 2 hours at 10 Hz. A larger number keeps

@@ -8,7 +8,7 @@ import numpy as np
 from objslam.config import Odometry
 from objslam.core.arrays import Floats
 from objslam.core.geometry import interpolate, interpolate_pair, inverse
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.frontend.odometry_drift import add_step, gathered_drift
 
 _PLANAR = 1e-6  # The tolerance (m, rad) of a planar path. A larger value accepts more paths.

@@ -14,8 +14,8 @@ from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate
 from objslam.core.result import RunResult
-from objslam.core.trajectory import correct_path
-from objslam.core.types import Association, Log, Trajectory
+from objslam.core.trajectory import Trajectory, correct_path
+from objslam.core.types import Association, Log
 from objslam.errors import SolveError
 from objslam.frontend.known_errors import warn_of_others
 from objslam.frontend.localization.odometry_clock import warn_of_two_clocks

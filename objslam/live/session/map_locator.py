@@ -13,7 +13,7 @@ from objslam.association.registration.object_maps import reason, register
 from objslam.core.arrays import Floats, Ints
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.snapshot import InPriorMap, Snapshot
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.frontend.up import on_its_side
 from objslam.graph.maps.live_prior_map import map_T_graph, tie_frame, tie_objects, untie
 from objslam.graph.maps.prior_map import beyond

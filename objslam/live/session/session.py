@@ -14,7 +14,7 @@ from objslam.config import Settings
 from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.snapshot import TOO_SLOW, Snapshot
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.errors import OutputError, one_line
 from objslam.io.threads import start_thread
 from objslam.live.bodies.centring import BodyCentring

@@ -9,7 +9,7 @@ from objslam.core.arrays import Floats
 from objslam.core.geometry import interpolate, inverse
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.snapshot import CameraFrame, Snapshot
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.graph.maps.live_prior_map import covariance_in_map, map_T_graph
 from objslam.live.bodies.description import BodyEstimator
 from objslam.live.mapper.landmark_table import LandmarkTable, covariances

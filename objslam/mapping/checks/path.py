@@ -9,8 +9,8 @@ from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats
 from objslam.core.geometry import interpolate, inverse, lengths
 from objslam.core.rotation import rotation_vector
-from objslam.core.trajectory import usual_seconds
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory, usual_seconds
+from objslam.core.types import Log
 from objslam.frontend.localization.localization_jumps import (
     ACCELERATION,
     FEWEST_STEPS,

@@ -3,7 +3,8 @@
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.types import Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Log
 from objslam.core.validity import MAX_LIVE_STAMP, UNITS_OF_TIME, unit_of_date
 from objslam.mapping.checks.finding import Finding
 

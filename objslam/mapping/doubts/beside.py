@@ -24,7 +24,9 @@ an object."""
 
 
 def on_objects(evidence: Evidence, left: Ints) -> Iterator[tuple[int, Ints]]:
-    """Yield landmarks and the rays without an object that lie on them. left: (M,) the rays without an object.
+    """Yield a landmark, and rays of one label that lie on it and have no object. A landmark comes once for each label.
+
+    left: (M,) the rays without an object.
 
     If a landmark has a box of its own elsewhere in the image, a ray at the landmark shows a neighbour, and does not lie on
     the landmark. If most rays of a label at a landmark show a neighbour, the other rays of the label show it too.

@@ -43,9 +43,10 @@ fit worse. With a larger number, fewer labels are left out by mistake."""
 class Named:
     """A map with one object for each label.
 
-    state: the solved map. agree: whether the rays agree with it. others: the map of the labels that agree, if the others
-    scatter alone. None if there is no such map, or if it is not sure. doubtful: the map of the labels that agree, if some of
-    them may name several objects. `others` is without these. None if no label is doubted.
+    state: the solved map. agree: whether the rays agree with it. others: the map without the labels that scatter, if all
+    other labels are names. None if there is no such map, or if it is not sure. doubtful: the map without the labels that
+    scatter, if some of the other labels may name several objects. These labels are not in `others`. None if no label is
+    doubted.
     """
 
     state: JointState

@@ -38,9 +38,11 @@ def odometry_contradicts(log: Log, settings: Settings) -> bool:
 
 
 def lasting_by_odometry(errors: SharedErrors | None) -> tuple[float, float]:
-    """Return the sizes of the lasting errors of the localisation that the odometry shows, as factors on `localization.yaw`
-    and `localization.xy`. They are 0 without odometry, or if the noise of the localisation is known. errors: of all frames,
-    because frames without a box count too."""
+    """Compare the localisation with the odometry. Return how large its lasting errors are, as factors on `localization.yaw`
+    and `localization.xy`. The factors are 0 without odometry, or if the noise of the localisation is known.
+
+    errors: of all frames, because frames without a box count too.
+    """
     if errors is None or "localization" not in errors.unknown_noise or errors.keyframes.odom_T_base is None:
         return 0.0, 0.0
     from objslam.graph.calibration.localization_noise import noise_of_paths  # It imports scipy.sparse. Few runs need it.

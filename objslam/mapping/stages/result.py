@@ -9,8 +9,8 @@ from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate
 from objslam.core.result import RunResult, Surface
-from objslam.core.trajectory import correct_path
-from objslam.core.types import Keyframes, Log, Trajectory
+from objslam.core.trajectory import Trajectory, correct_path
+from objslam.core.types import Keyframes, Log
 from objslam.frontend.keyframes import with_given_stamps
 from objslam.mapping.describe import make_result, summarise
 from objslam.mapping.localization import Localization, PriorMap, describe_in_map, localize, moved_log

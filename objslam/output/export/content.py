@@ -8,7 +8,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.object_map import ObjectMap
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.errors import ConfigError
 from objslam.io.odometry_parquet import Motions
 from objslam.io.results.read import is_site, load_map, load_motions, load_trajectory

@@ -8,7 +8,8 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.object_map import ObjectMap
-from objslam.core.types import Trajectory, Truth, Up
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Truth, Up
 from objslam.frontend.up import from_above, up_vector
 from objslam.io.rays_parquet import RaysTable
 from objslam.output.plot.figure import Colour

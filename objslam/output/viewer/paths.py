@@ -8,7 +8,8 @@ import rerun as rr
 from objslam.core.arrays import Floats
 from objslam.core.geometry import quaternion
 from objslam.core.result import RunResult
-from objslam.core.types import Trajectory, Truth
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import Truth
 from objslam.output.plot.style import evenly, label_colours
 from objslam.output.viewer.times import iteration_column, stamp_column
 

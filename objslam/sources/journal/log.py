@@ -6,7 +6,8 @@ import numpy as np
 
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import CameraLog, Detections, Log, Trajectory, label_table
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log, label_table
 from objslam.errors import LogError
 from objslam.sources.journal.reader import messages
 from objslam.sources.journal.records import CameraMessage, FrameMessage, HeldMounts, MountMessage, PoseMessage

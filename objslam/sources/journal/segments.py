@@ -103,7 +103,7 @@ def contents(path: Path, ledger: Ledger) -> Iterator[tuple[str, bytes]]:
 
 
 def sealed(file: Path, identity: bytes, number: int) -> Path:
-    """Return the path that an earlier segment has until it is compressed."""
+    """Return the path of a finished segment that is not compressed yet."""
     return file.with_name(f"journal-{identity.hex()}.{number:06d}.objslam")
 
 

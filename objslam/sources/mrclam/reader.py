@@ -13,7 +13,8 @@ from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2, make_pose
-from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject, label_table
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Log, Truth, TruthObject, label_table
 from objslam.core.validity import valid_depths, valid_positions, valid_stamps
 from objslam.errors import LogError
 from objslam.io.text import Table, count_drops, in_order, read_table, reading, select

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.errors import LogError
 from objslam.io.camera_yaml import Calibration, Mount
 from objslam.ros.messages.camera_info import camera_names, camera_of

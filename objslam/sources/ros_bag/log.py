@@ -13,7 +13,8 @@ import numpy as np
 
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import CameraLog, Images, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Images, Log
 from objslam.errors import LogError
 from objslam.frontend.box_depths import depths_at_boxes
 from objslam.io.camera_yaml import read_calibrations, read_mounts

@@ -17,7 +17,8 @@ class CameraPlace:
 
 
 def camera_places(tree: TfTree, base: str) -> tuple[CameraPlace, ...]:
-    """Return the frames that tf connects to base and whose names end in "optical" or "optical_frame", sorted by name."""
+    """Return the places of the frames that tf connects to base, sorted by name. Their names end in "optical" or
+    "optical_frame"."""
     places = []
     for frame in sorted(frame for frame in tree.frames if frame.endswith(("optical_frame", "optical"))):
         try:

@@ -6,7 +6,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.errors import LogError
 from objslam.io.text import count_drops, in_order
 from objslam.ros.messages.topic_types import ODOMETRY

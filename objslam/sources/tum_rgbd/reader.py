@@ -19,7 +19,8 @@ import numpy as np
 from objslam.core.camera import Camera
 from objslam.core.coco import COCO_NAMES
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import CameraLog, Detections, Images, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Detections, Images, Log
 from objslam.errors import LogError
 from objslam.frontend.box_depths import depths_at_boxes
 from objslam.io.box_collector import BoxCollector

@@ -224,8 +224,8 @@ def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, shar
 def covariance_with_unlike(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, share: Floats) -> tuple[Floats, Floats]:
     """Return `covariance_of`, and what is added to it because no thing has exactly the shape of its body (`UNLIKE`).
 
-    The error of a side also changes with the distance. Otherwise the growth of boxes on the way to a thing would give its
-    distance exactly, however wrong its outline is.
+    The error of a side is not the same from all distances. If it were, the growth of boxes on the way to a thing would give
+    its distance exactly, however wrong its outline is.
     """
     count = len(fit.values)
     loose = np.zeros((len(edges), ROWS))

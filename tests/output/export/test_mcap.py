@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReader
 from objslam.core.bodies.body import Body
 from objslam.core.geometry import quaternion
 from objslam.core.object_map import MapObject, ObjectMap
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import Trajectory
 from objslam.errors import OutputError
 from objslam.io.results.read import load_map, load_trajectory
 from objslam.output.export import write_export

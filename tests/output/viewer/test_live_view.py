@@ -21,7 +21,8 @@ from objslam.core.camera import Camera
 from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.snapshot import CameraFrame, Snapshot
-from objslam.core.types import CameraLog, Images, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Images, Log
 from objslam.errors import ConfigError, OutputError
 from objslam.output.viewer import application
 from objslam.output.viewer.images import of_log

@@ -9,7 +9,8 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.geometry import inverse, lift_se2, make_pose
-from objslam.core.types import CameraLog, Log, Trajectory
+from objslam.core.trajectory import Trajectory
+from objslam.core.types import CameraLog, Log
 from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis, with_cameras
 from objslam.mapping.checks.hypotheses.mounts import mounts, w_last
 

@@ -16,9 +16,12 @@ fit counts as an object. About a tenth of the boxes of another recording fit an 
 def check_halves(late: Bools, fits: Bools) -> Finding | None:
     """Return a finding if one half of the log fits worse than the other half.
 
-    late: (R,) whether a ray is in the second half. fits: (R,) whether it fits its object.
+    late: (R,) whether a ray is in the second half. fits: (R,) whether it fits its object. A half without rays differs from
+    nothing.
     """
-    shares = [float(fits[mask].mean()) if mask.any() else 0.0 for mask in (~late, late)]
+    if late.all() or not late.any():
+        return None
+    shares = [float(fits[mask].mean()) for mask in (~late, late)]
     if min(shares) >= _HALF * max(shares):
         return None
     return Finding(
