@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -23,7 +22,9 @@ _SETTLED = 1e-9
 value leaves positions that the solver would still move. Those of settled landmarks move by 1e-15 m."""
 _PAIRS_AT_ONCE = 1 << 15  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
-_TABLE = 1 << 22  # The most entries of a dense table of gains. Larger tables are sparse.
+_TOGETHER = 1 << 10
+"""The Hungarian method gets parts of frames with about this number of edges at a time. Each call has a fixed cost. With
+a larger number, there are fewer calls, and each takes longer, because the method visits all its rays for each of them."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,8 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
 
     A landmark gets at most one ray per frame. A frame falls into parts that share no ray and no landmark, and each part is
     solved alone. In most parts, each ray (or each landmark) simply takes its best edge. The Hungarian method solves the
-    rest. cost: (E,) of each edge. frame: (R,) of each ray. unmatched: the cost of a ray without a landmark.
+    rest, many parts at a time. cost: (E,) of each edge. frame: (R,) of each ray. unmatched: the cost of a ray without a
+    landmark.
     """
     chosen = np.full(len(frame), -1, dtype=np.int64)
     useful = np.flatnonzero(cost < unmatched)
@@ -152,7 +154,8 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
         return chosen
     ray, landmark, gain = edges.ray[useful], edges.landmark[useful], unmatched - cost[useful]
     # A place is one landmark in one frame.
-    places, place = np.unique(frame[ray] * (int(landmark.max()) + 1) + landmark, return_inverse=True)
+    count = int(landmark.max()) + 1
+    places, place = np.unique(frame[ray] * count + landmark, return_inverse=True)
     if len(places) == len(ray) == len(np.unique(ray)):  # Nothing competes, as in many small logs.
         chosen[ray] = landmark
         return chosen
@@ -168,15 +171,13 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
         taken = rest[best[apart[best]]]
         chosen[ray[taken]] = landmark[taken]
         rest = rest[~apart]
-    order = np.lexsort((landmark[rest], ray[rest], part[rest]))
-    rest = rest[order]
-    ray, landmark, gain, part = ray[rest], landmark[rest], gain[rest], part[rest]
-    bounds = np.flatnonzero(np.diff(part, prepend=-1, append=-1)).tolist()
-    for i, j in pairwise(bounds):
-        rows, r = np.unique(ray[i:j], return_inverse=True)
-        columns, c = np.unique(landmark[i:j], return_inverse=True)
-        row, column = pair_up(r, c, gain[i:j], (len(rows), len(columns)))
-        chosen[rows[row]] = columns[column]
+    rest = rest[np.lexsort((place[rest], ray[rest], part[rest]))]
+    begins = np.flatnonzero(np.diff(part[rest], prepend=-1))
+    for at in np.split(rest, begins[np.flatnonzero(np.diff(begins // _TOGETHER, prepend=0))]):
+        rows, r = np.unique(ray[at], return_inverse=True)
+        columns, c = np.unique(place[at], return_inverse=True)
+        row, column = pair_up(r, c, gain[at], (len(rows), len(columns)))
+        chosen[rows[row]] = places[columns[column]] % count
     return chosen
 
 
@@ -204,17 +205,10 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
     Each row and each column is in at most one pair. row, column, gain: (E,) of the possible pairs, with gains above 0.
     shape: the numbers of rows and columns.
     """
-    from scipy.optimize import linear_sum_assignment
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
     rows, columns = shape
-    if rows * columns <= _TABLE:
-        dense = np.zeros(shape)
-        dense[row, column] = gain
-        first, second = linear_sum_assignment(dense, maximize=True)
-        real = dense[first, second] > 0
-        return first[real], second[real]
     # The sparse method pairs every row. So each row gets an extra column of its own, which means no pair.
     each = np.arange(rows)
     value = np.concatenate([gain, np.zeros(rows)]) + 1.0  # The sparse method ignores entries of 0.

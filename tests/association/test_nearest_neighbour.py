@@ -9,6 +9,7 @@ import pytest
 from association_scenes import watch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import linear_sum_assignment
 
 from objslam.association.gating import Edges, best_assignment, gate_limit, gated_edges, tangent_basis, track_bonus
 from objslam.association.landmarks import Landmarks
@@ -60,15 +61,23 @@ def test_the_choice_is_the_best_of_all_choices(seed, rays, landmarks):
     np.testing.assert_allclose(total(chosen, costs, 10.0), best)
 
 
+@pytest.mark.parametrize("together", [1, 20, 1 << 10])
 @pytest.mark.parametrize("seed", range(5))
-def test_a_choice_from_a_table_that_is_not_written_out_is_the_same(seed, monkeypatch):
+def test_the_choice_in_many_frames_is_the_best_of_each_frame(seed, together, monkeypatch):
+    """However many parts of frames are solved in one call."""
+    monkeypatch.setattr("objslam.association.gating._TOGETHER", together)
     rng = np.random.default_rng(seed)
-    ray, landmark = np.nonzero(rng.random((60, 50)) < 0.1)
-    cost, frame = rng.uniform(0, 12, len(ray)), np.zeros(60, dtype=np.int64)
-    written = best_assignment(edges_of(ray, landmark, cost), cost, frame, 10.0)
-    monkeypatch.setattr("objslam.association.gating._TABLE", 0)
-    np.testing.assert_array_equal(best_assignment(edges_of(ray, landmark, cost), cost, frame, 10.0), written)
-    assert 0 < (written >= 0).sum() < 60
+    costs = np.where(rng.random((600, 50)) < 0.1, rng.uniform(0, 12, (600, 50)), np.inf)
+    ray, landmark = np.nonzero(np.isfinite(costs))
+    frame = np.repeat(np.arange(10), 60)
+    chosen = best_assignment(edges_of(ray, landmark, costs[ray, landmark]), costs[ray, landmark], frame, 10.0)
+    for of in frame == np.arange(10)[:, None]:
+        gain = np.maximum(10.0 - costs[of], 0.0)
+        row, column = linear_sum_assignment(gain, maximize=True)
+        best = np.full(of.sum(), -1)
+        best[row] = np.where(gain[row, column] > 0, column, -1)
+        np.testing.assert_array_equal(chosen[of], best)
+        assert 0 < (best >= 0).sum() < of.sum()
 
 
 def test_a_frame_of_10_000_boxes_that_all_compete_needs_no_table_of_them():
