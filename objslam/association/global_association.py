@@ -34,21 +34,19 @@ _TURNS = 8
 """The most searches of one kind among the unassigned rays. They end when one finds none. A larger number may find more."""
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
 _SAMPLE = 4096
-"""The most rays of one label that a search uses, in whole frames. Later searches use other frames. A larger number costs
-time."""
+"""The most rays of one label that a search uses, in whole frames. Later searches use other frames. More rays are slower."""
 _FRAMES = 12
-"""The fewest frames that a search uses, because an object is where rays of several frames meet. A larger number costs
-time."""
+"""The fewest frames that a search uses, because an object is where rays of several frames meet. More frames are slower."""
 _MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have many rays. A larger value costs time.
-_MIN_SUPPORT = 2.5
-"""The least support of a point in a search. A ray that fits perfectly counts 1. A larger one finds fewer, surer points."""
+_MIN_SUPPORT = (
+    2.5  # The least support of a point. A ray that fits perfectly counts 1. A larger one finds fewer, surer points.
+)
 _ABOVE_CHANCE = 3.0
-"""The least excess of a point's support over the support by stray rays, in standard deviations. A larger excess finds fewer,
-surer points."""
+"""The least excess of a point's support over that by stray rays, in standard deviations. A larger one finds surer points."""
 _CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search. A larger one drops weak objects.
 _CLEAR_MOTION = 3.0
-"""If the log odds of a moving point over a point at rest are above this, several points at rest are tried for its rays. With
-smaller odds, they are tried more often, which takes time."""
+"""If the log odds of a moving point over a point at rest are above this, several points at rest are tried for its rays.
+Smaller odds try them more often, which takes time."""
 _EXPLAINED = 0.9
 """Points at rest replace moving points if they explain at least this share of their rays. With a smaller share, parts of the
 path of a moving thing become objects. With a larger share, wrong boxes keep things at rest from being found."""
@@ -76,6 +74,7 @@ def associate_globally(
     guess: tuple[Association, Floats] | None = None,
     drifts: bool = False,
     solved: bool = False,
+    repaired: bool = False,
 ) -> Association:
     """Assign rays to objects at known camera poses.
 
@@ -87,6 +86,7 @@ def associate_globally(
         guess: an initial association of the rays, and the positions (N, 3) m of its objects. NaN drops an object.
         drifts: whether the poses drift as the odometry does, so that objects at rest seem to move.
         solved: whether the poses are from a joint solve. The rays of one thing meet there, as at localised poses.
+        repaired: whether the guess has no landmarks at crossings of rays. They are not searched, which halves the time.
     """
     rays, keyframes, cameras = of.rays, of.keyframes, of.cameras
     obs, ray, keyframe = observe(of)
@@ -107,7 +107,8 @@ def associate_globally(
         state, refuted = _at_rest(task, state, refuted, moving)
     state, likely, dropped = _merged_and_dropped(task, _add_distant(task, state))
     refuted |= dropped
-    if solved or keyframes.localized_every:  # At poses that drift, the rays of one thing fall into bundles that do not meet.
+    # At poses that drift, the rays of one thing fall into bundles that do not meet.
+    if (solved or keyframes.localized_every) and not repaired:
         for repair in (_without_crossings, _without_ghosts):
             state, likely, dropped = repair(task, state, likely, sized)
             refuted |= dropped
@@ -121,9 +122,7 @@ def associate_globally(
     state, likely = _by_size(task, state, likely, sized)
     if solved or keyframes.localized_every:
         # This comes last: the things of these bundles get no landmarks, so a further assignment would give their rays back.
-        state = without_smaller_bundles(state, sized)
-        stays = _plausible(task, state)
-        state, likely = state.keep(stays), likely[stays]
+        state, likely = _kept(task, without_smaller_bundles(state, sized), likely)
     return replace(_result(state, likely, ray), refuted=(refuted & (state.matched < 0))[np.argsort(ray)])
 
 
@@ -215,8 +214,7 @@ def _discover(
 
 
 def _add_distant(task: _Task, state: State) -> State:
-    """Add landmarks where rays without parallax agree. Such rays come from distant objects, or from a robot that hardly
-    moves."""
+    """Add landmarks where rays without parallax agree: those of distant objects, or of a robot that hardly moves."""
     known = state.count
     state = _alternate(task, _discover(task, state, _TURNS, 0.0), 2)
     index, direction = state.owner, state.obs.direction[state.assigned]
@@ -246,14 +244,17 @@ def _by_size(task: _Task, state: State, likely: Floats, sized: Bools) -> tuple[S
         lambda now: np.ones(now.count, dtype=bool),
         unmatched=lambda now, edges: task.gate - size_costs(now, edges),
     )
-    every = replace(every, obs=obs)
-    stays = _plausible(task, every)
-    return every.keep(stays), likely[stays]
+    return _kept(task, replace(every, obs=obs), likely)
 
 
 def _plausible(task: _Task, state: State) -> Bools:
     """Return which landmarks (N,) have enough rays and are near enough. Farther away, only parallel rays meet."""
     return (state.ray_count >= task.settings.min_rays) & near(state)
+
+
+def _kept(task: _Task, state: State, likely: Floats) -> tuple[State, Floats]:
+    stays = _plausible(task, state)
+    return state.keep(stays), likely[stays]
 
 
 def _merge_round(task: _Task, state: State, across_labels: bool = False) -> State:
@@ -339,8 +340,7 @@ def _drop(task: _Task, state: State, likely: Floats) -> State:
 
 
 def _result(state: State, existence: Floats, ray: Ints) -> Association:
-    """Return the association with its objects in their final order. existence: (N,) of each landmark. ray: (R,) of each
-    observation."""
+    """Return the association with its objects in their final order. existence: (N,). ray: (R,) of each observation."""
     counts, label = state.label_count, state.label
     first = np.full(len(label), len(ray))
     np.minimum.at(first, state.owner, state.assigned)

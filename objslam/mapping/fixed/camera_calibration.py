@@ -49,8 +49,10 @@ def calibrate_fixed(
     """Estimate the shared errors of cameras at known poses, in turns with the association and the objects.
 
     The association allows for the present uncertainty of the errors: first their prior, then the covariance of the last fit.
-    In rows of equal things, it allows only for the part of the uncertainty that moves rays off their objects. The covariance
-    of the errors is added to the covariance of the objects. Returns the input without the errors, the association, the
+    In rows of equal things, it allows only for the part of the uncertainty that moves rays off their objects. If the errors
+    still change after two associations, the next ones begin with the objects that there are, because searches among all rays
+    take long, and each finds a few other objects. After these have settled, there is one more search. The covariance of the
+    errors is added to the covariance of the objects. Returns the input without the errors, the association, the
     estimate, and the number of objects in each round. If the errors cannot be estimated, they stay as they were, and the
     ledger gets a warning.
     """
@@ -67,12 +69,13 @@ def calibrate_fixed(
     told = noise_of_errors(every, calibration)
     rounds: tuple[dict[str, int], ...] = ()
     earlier: list[tuple[Floats, Floats]] = []
-    in_rows = False
+    in_rows = settled = False
+    guess: tuple[Association, Floats] | None = None  # Without a guess, an association searches among all rays.
     now = at.without(errors, calibration.values)
     for number in range(MOST_ROUNDS):
         progress(f"association, round {number + 1}", 0, 0)
         if number:
-            association = now.associate(told)
+            association = now.associate(told, guess)
             progress("solve", 0, 0)
             trial = _tried(at, now, errors, calibration, association, trace)
         else:
@@ -98,7 +101,11 @@ def calibrate_fixed(
             _rms(angle / before) < SAME and _rms(allowed / before - 1) < SAME
             for angle, (_, before) in zip(turned, earlier, strict=True)
         ):
-            break
+            if guess is None or settled:
+                break
+            guess, settled = None, True
+        elif number or in_rows:
+            guess = association, trial.moved
     else:
         ledger.warn(f"the shared errors still change after {MOST_ROUNDS} rounds of association")
     assert found is not None  # There is at least one round.

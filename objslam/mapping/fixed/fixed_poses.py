@@ -80,13 +80,17 @@ class FixedPoses:
         agreeing = replace(association, object=np.where(weight > 0, association.object, -1))
         return noise_in_frames(self.seen, self.rays_seen, agreeing, positions, self.settings)
 
-    def associate(self, more: Floats | float = 0.0) -> Association:
-        """Associate the rays. more: (R,) rad, noise of the ray directions in addition to the noise of boxes and poses."""
+    def associate(self, more: Floats | float = 0.0, guess: tuple[Association, Floats] | None = None) -> Association:
+        """Associate the rays. more: (R,) rad, noise of the ray directions in addition to the noise of boxes and poses.
+
+        guess: an association at nearly these poses, and the positions (N, 3) m of its objects. The association begins there.
+        """
         from objslam.association.global_association import associate_globally
 
         if self.settings.association.method == "by_label":
             return associate_by_label(self.rays_seen)
-        return associate_globally(self._posed(more), self.settings, seed=self.settings.seed)
+        of, seed = self._posed(more), self.settings.seed
+        return associate_globally(of, self.settings, seed=seed, guess=guess, repaired=guess is not None)
 
     def completed(
         self,
