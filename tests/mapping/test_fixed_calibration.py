@@ -16,6 +16,7 @@ from objslam.core.result import RunResult
 from objslam.core.types import Log
 from objslam.io.calibration_yaml import dump_calibration
 from objslam.mapping import pipeline
+from objslam.mapping.fixed.fixed_poses import FixedPoses
 from objslam.simulation import make_camera, preset, simulate
 
 SEEDS = range(3)
@@ -175,3 +176,27 @@ def test_small_errors_do_not_hide_the_objects_of_a_short_drive():
     held, found = run(log, HELD), run(log)
     assert len(held.map.resolved()) > 10
     assert len(found.map.resolved()) > 0.8 * len(held.map.resolved())
+
+
+def test_errors_that_settle_slowly_are_settled_from_the_objects_that_there_are(monkeypatch):
+    """A clock that is off by 0.4 s takes several rounds. The first ones and one more search among all rays. All others begin
+    with the objects of the round before."""
+    searched, associate = [], FixedPoses.associate
+
+    def noted(self, more=0.0, guess=None):
+        searched.append(guess is None)
+        return associate(self, more, guess)
+
+    monkeypatch.setattr(FixedPoses, "associate", noted)
+    log, _ = drive(1, wrong=False)
+    late = add_shared_errors(log, {"front.clock": 0.4})
+    result = run(late, "calibration.clock=1")
+    found = result.calibration
+    assert found is not None
+    at = found.names.index("front.clock")
+    assert abs(found.values[at] - 0.4) < 0.02
+    assert rms([distance for distance, _ in off(log, result)]) < 0.05
+    first = searched.index(False)
+    assert searched[:first] == [True] * first
+    assert searched[first:].count(True) == 1
+    assert searched.count(False) >= 2

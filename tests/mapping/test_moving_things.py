@@ -16,8 +16,10 @@ from objslam.core.types import Association, Log
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
+from objslam.frontend.tracks import tracks_of_rays
 from objslam.mapping import pipeline
 from objslam.mapping.joint.joint_alternation import JointState
+from objslam.mapping.moves import moving_things
 from objslam.mapping.moves.moving_things import associated_at_rest, things_at_rest, without_moving_things
 from objslam.mapping.solution import seen_something
 from objslam.simulation import preset, simulate
@@ -145,6 +147,36 @@ def test_a_map_of_things_at_rest_stays_the_same() -> None:
     state = solved(simulate(preset("rooms", placed=row, objects=6, classes=3, missed=0.3, false=0.1), 3))
     assert without_moving_things(state) is state
     assert associated_at_rest(state) is state
+
+
+@pytest.mark.parametrize("missed", [0.0, 0.2])
+def test_tracks_that_join_neighbours_move_nothing_if_all_their_rays_have_objects(missed: float, monkeypatch) -> None:
+    """The boxes of a row of large things scatter more than those of other things, and their tracks join neighbours. If their
+    things moved, a share of the rays would be of no object."""
+    row = tuple(("cup", (-1.5 + 0.3 * number, 1.0, 0.5)) for number in range(10))
+    state = solved(simulate(preset("rooms", placed=row, objects=6, classes=3, missed=0.0, false=0.0), 3))
+    found, estimate, cup = state.association, state.estimate, state.rays.label_names.index("cup")
+    assert found is not None
+    assert estimate is not None
+    rng = np.random.default_rng(0)
+    mine = (state.rays.label == cup) & (found.object >= 0)
+    given = tracks_of_rays(state.keyframes, state.rays, state.solved_poses)[0]
+    joined = given.copy()  # Each track of the row goes on as that of another thing of the row.
+    of_row = np.isin(given, np.unique(given[mine]))
+    tracks, place = np.unique(given[of_row], return_inverse=True)
+    joined[of_row] = rng.permutation(len(tracks))[place] // 2
+    joined[~of_row] += len(tracks)
+    track, length = np.unique(joined, return_inverse=True, return_counts=True)[1:]
+    monkeypatch.setattr(moving_things, "tracks_of_rays", lambda *_: (track, length))
+    scatter = np.where(mine[:, None], rng.normal(0, 2 * state.rays.sigma[:, None], (len(mine), 3)), 0.0)
+    direction = state.rays.direction + scatter
+    rays = replace(state.rays, direction=direction / np.linalg.norm(direction, axis=1, keepdims=True))
+    left = replace(found, object=np.where(mine & (rng.random(len(mine)) < missed), -1, found.object))
+    poses = state.keyframes, rays, left, replace(estimate, weight=np.ones(len(mine))), state.solved_poses, state.settings
+    cups = left.label == cup
+    gone = moving_things._moving(*poses, None)
+    assert gone[cups].mean() == (1.0 if missed else 0.0)
+    assert not gone[~cups].any()
 
 
 def with_carts_at_rest(log: Log, places: Floats) -> Log:
