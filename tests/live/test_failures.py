@@ -3,8 +3,8 @@
 import errno
 import importlib
 import json
+import signal
 import threading
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -287,7 +287,7 @@ class Asleep:
     """A request that is never answered."""
 
     def __reduce__(self):
-        return time.sleep, (1e6,)
+        return signal.pause, ()
 
 
 def test_a_worker_ends_with_its_session_in_the_middle_of_a_request(own_processes):
