@@ -1,20 +1,19 @@
 """Solve a whole log in one factor graph: objects at fixed poses, or poses and objects together."""
 
 from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from objslam.association.observations import MIN_DEPTH
-from objslam.config import Loss, Settings
-from objslam.core.arrays import Bools, Floats, Ints
+from objslam.config import Settings
+from objslam.core.arrays import Bools, Floats
 from objslam.core.calibration import CalibratedMeasurements, Calibration
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.geometry import angles_off
 from objslam.core.ground.flattening import flattened_lines, flattened_points, raised_covariances, raised_points
-from objslam.core.statistics import CAUCHY_K, HUBER_K, widening
+from objslam.core.statistics import widening
 from objslam.core.trace import Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
@@ -25,22 +24,12 @@ from objslam.graph.fixed_pose_triangulation import flat_noise
 from objslam.graph.init_known_correspondences import initialize_known
 from objslam.graph.multi_start import MultiStart
 from objslam.graph.multiframes import Multiframes
-from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
+from objslam.graph.optimizers import build_graph, optimize, trace_solve
 from objslam.graph.outlier_rejection import ROUNDS, JointSolution, misfit, reject_outliers, rejected_stretches
-from objslam.graph.posterior.evidence import log_evidence
-from objslam.graph.posterior.marginals import (
-    Solved,
-    SolvedGraph,
-    SolvedMeasurements,
-    correlated_factor,
-    joint_covariances,
-    largest_sigma,
-    marginal_covariances,
-    seen_covariances,
-)
+from objslam.graph.posterior.joint_estimate import SolvedErrors, estimate_of
+from objslam.graph.posterior.marginals import largest_sigma
 from objslam.graph.robust_cost import ray_information
 from objslam.graph.tags.corner_rays import TagCorners
-from objslam.graph.tags.estimate import with_objects
 from objslam.graph.tags.fixed import tags_at_poses
 from objslam.graph.variables import make_values, with_points
 from objslam.triangulation.triangulate import Triangulation
@@ -91,7 +80,7 @@ def solve_fixed(
     across = np.hypot(angle * distance, place)
     residual = angles_off(origins, n, flat[landmark]) * distance / across
     weight = start.weight.copy()
-    weight[used] = _weights(loss, residual, optimum)
+    weight[used] = optimum.ray_weights(loss, residual)
     covariance = start.covariance
     if loss != "l1":
         along = np.where(np.isfinite(some.range), some.range_sigma**-2, 0.0)
@@ -165,153 +154,108 @@ def solve_joint(
         return Measurements.of(keyframes, share_bias(rays, association), settings, multiframes, tags, ties)
 
     measured = measure(*given)
-    keyframes, rays = measured.keyframes, measured.rays
-    positions = np.full((association.count, 3), np.nan)
-    map_T_camera = keyframes.map_T_camera
     if trace is not None:
-        trace.base_T_camera = keyframes.base_T_camera
-    grown = start is None and not keyframes.localized_every
-    if start is not None:
-        map_T_camera = start[multiframes.first]
-        if places is not None and tags is None:  # The corners of fiducials have no known positions.
-            positions = places
-    elif grown:
-        map_T_camera, positions = initialize_known(measured, association, progress, trace)
-    nothing = np.zeros(len(rays), dtype=bool)
-    tolerance = _TOLERANCE if errors is None else _TOLERANCE_BEFORE
-    rounds = ROUNDS if errors is None else _ROUNDS_BEFORE
+        trace.base_T_camera = measured.keyframes.base_T_camera
+    begin = None if start is None else start[multiframes.first]
+    shared = None if errors is None or theta is None or hold else (errors, measure, theta)
+    of_solve = _Solve(measured, association, shared, errors is not None, trace)
+    found = of_solve.found(begin, None if tags is not None else places, progress, returns=places is None)
+    if errors is None or theta is None:
+        return estimate_of(measured, association, found, SolvedErrors(), ledger)
+    held = Calibration(errors.names, theta, errors.prior, np.sqrt(np.diagonal(errors.prior)))
+    if hold:
+        return estimate_of(measured, association, found, SolvedErrors(errors, held), ledger)
+    from objslam.graph.calibration.self_calibration import calibrate  # It imports scipy.sparse. No other solve needs it.
 
-    def from_start(map_T_camera: Floats, positions: Floats, trace: Trace | None) -> JointSolution:
-        begin = measured, association, map_T_camera, positions, nothing, nothing
-        return reject_outliers(*begin, trace, tolerance, rounds, close=grown or places is not None)
+    try:
+        calibrated = calibrate(errors, measure, association, found, theta, trace)
+    except (SolveError, np.linalg.LinAlgError) as error:
+        ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
+        return estimate_of(measured, association, found, SolvedErrors(errors, held, failed=True), ledger)
+    solved_errors = SolvedErrors(calibrated.errors, calibrated.calibration, calibrated.sensitivity)
+    return estimate_of(calibrated.measured, association, calibrated.found, solved_errors, ledger)
 
-    def misfit_of(solution: JointSolution) -> float:
-        if errors is None or theta is None or hold:
-            return misfit(solution.map_T_camera, solution.positions, measured, association)
-        from objslam.graph.calibration.self_calibration import misfit_at_shared_errors
 
-        return misfit_at_shared_errors(errors, measure, association, solution, theta)
+@dataclass(frozen=True)
+class _Solve:
+    """A joint solve before its shared errors are estimated.
 
-    found = from_start(map_T_camera, positions, trace)
-    if grown:
-        found = MultiStart(measured, association, from_start, misfit_of).best(found, trace)
-    loose = keyframes.odom_T_base is not None and not keyframes.localized_every and places is None
-    back = rejected_stretches(rays, association, found) if loose else nothing
-    if back.any():
+    shared: what their estimation needs: the errors, the measurements as a function of them, and their values. None if there
+    are none, or if they are held. roughly: whether there are shared errors, held or not.
+    """
+
+    measured: Measurements
+    association: Association
+    shared: tuple[CalibratedMeasurements, Callable[[Keyframes, Rays, Settings], Measurements], Floats] | None
+    roughly: bool
+    trace: Trace | None
+
+    def found(
+        self, start: Floats | None, places: Floats | None, progress: Callable[[int, int], None], *, returns: bool
+    ) -> JointSolution:
+        """Return the solution with the inliers.
+
+        start: (P, 4, 4) the first poses, else those of the localisation, or of a growing graph. places: (N, 3) m, the first
+        positions, None if unknown. returns: whether the rays of rejected stretches return once.
+        """
+        measured, keyframes = self.measured, self.measured.keyframes
+        map_T_camera = keyframes.map_T_camera if start is None else start
+        positions = np.full((self.association.count, 3), np.nan) if start is None or places is None else places
+        grown = start is None and not keyframes.localized_every
+        if grown:
+            map_T_camera, positions = initialize_known(measured, self.association, progress, self.trace)
+        close = grown or not returns
+
+        def from_start(map_T_camera: Floats, positions: Floats, trace: Trace | None) -> JointSolution:
+            begin = measured, self.association, map_T_camera, positions, self._nothing, self._nothing
+            return reject_outliers(*begin, trace, self._tolerance, self._rounds, close=close)
+
+        found = from_start(map_T_camera, positions, self.trace)
+        if grown:
+            found = MultiStart(measured, self.association, from_start, self._misfit).best(found, self.trace)
+        loose = keyframes.odom_T_base is not None and not keyframes.localized_every and returns
+        return self._with_returned_stretches(found) if loose else found
+
+    def _with_returned_stretches(self, found: JointSolution) -> JointSolution:
+        """Return the solution after the rays of rejected stretches returned, if it has the lower cost."""
+        measured, association, trace = self.measured, self.association, self.trace
+        back = rejected_stretches(measured.rays, association, found)
+        if not back.any():
+            return found
         attempt = trace.aside() if trace is not None else None
         before, other, again = misfit(found.map_T_camera, found.positions, measured, association), found, back
-        for limit in (1, rounds - 1):  # Returned rays that belong to their objects lower the misfit after the first round.
+        for limit in (1, self._rounds - 1):  # Returned rays that belong to their objects lower the misfit at once.
             begin = measured, association, other.map_T_camera, other.positions, other.used, again
-            tried = reject_outliers(*begin, attempt, tolerance, limit, other.near, close=True)
-            other, again = replace(tried, iterations=other.iterations + tried.iterations), nothing
+            tried = reject_outliers(*begin, attempt, self._tolerance, limit, other.near, close=True)
+            other, again = replace(tried, iterations=other.iterations + tried.iterations), self._nothing
             if misfit(other.map_T_camera, other.positions, measured, association) >= before:
-                break
-        else:
-            found = replace(other, cost_before=found.cost_before)
-            if trace is not None and attempt is not None:
-                trace.take(attempt)
-    calibrated, calibration, failed = None, None, False
-    if errors is not None and theta is not None and hold:
-        calibration = Calibration(errors.names, theta, errors.prior, np.sqrt(np.diagonal(errors.prior)))
-    elif errors is not None and theta is not None:
-        from objslam.graph.calibration.self_calibration import calibrate  # It imports scipy.sparse. No other solve needs it.
+                return found
+        if trace is not None and attempt is not None:
+            trace.take(attempt)
+        return replace(other, cost_before=found.cost_before)
 
-        try:
-            calibrated = calibrate(errors, measure, association, found, theta, trace)
-        except (SolveError, np.linalg.LinAlgError) as error:
-            ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
-            calibration = Calibration(errors.names, theta, errors.prior, np.sqrt(np.diagonal(errors.prior)))
-            failed = True
-        else:
-            errors, calibration = calibrated.errors, calibrated.calibration
-            measured, found = calibrated.measured, calibrated.found
-            keyframes, rays = measured.keyframes, measured.rays
-    map_T_camera, positions, used, optimum = found.map_T_camera, found.positions, found.used, found.optimum
+    def _misfit(self, solution: JointSolution) -> float:
+        """Return the misfit of a solution, at the shared errors that fit it best if they are estimated."""
+        if self.shared is None:
+            return misfit(solution.map_T_camera, solution.positions, self.measured, self.association)
+        from objslam.graph.calibration.self_calibration import misfit_at_shared_errors
 
-    landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
-    origins, directions = (a[used] for a in rays.in_map(map_T_camera))
-    seen = positions[association.object[used]]
-    residual = angles_off(origins, directions, seen) / rays.sigma[used]
-    weight = np.zeros(len(rays))
-    weight[used] = _weights(settings.joint.loss, residual, optimum)
-    covariance = np.full((association.count, 3, 3), np.nan)
-    inliers = used & (weight > 0)
-    at = association.object, inliers, map_T_camera, positions
-    solved: Solved = SolvedMeasurements(measured, association, *at[1:], found.near)
-    if tags is not None:
-        solved = SolvedGraph(measured.whole(*at, "gnc")[0], optimum.values)
-    covariance[landmarks] = marginal_covariances(solved, landmarks, ledger)
-    known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
-    drift = correlated_factor(solved, known, covariance[known])
-    correlated = np.zeros((association.count, 3, drift.shape[2]))
-    correlated[known] = drift
-    seen_sigma = largest_sigma(covariance)
-    witness = _witnesses(rays, association, used & (weight > 0))
-    reach = np.linalg.norm(positions - map_T_camera[witness, :3, 3], axis=1)
-    far = np.flatnonzero(seen_sigma > settings.triangulation.max_rel_sigma * reach)
-    seen_sigma[far] = largest_sigma(seen_covariances(solved, far, witness[far], ledger))
-    body = np.arange(association.count) if tags is None else tags.object_of_landmark()
-    wider = widening(residual, body[association.object[used]], association.count)[body]
-    covariance *= wider[:, None, None]
-    seen_sigma *= np.sqrt(wider)
-    if calibrated is not None:
-        by_error = calibrated.sensitivity
-        covariance += by_error @ calibrated.calibration.covariance @ np.swapaxes(by_error, 1, 2)
-        covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
-        correlated = np.concatenate([correlated, np.nan_to_num(by_error) @ calibrated.calibration.root], axis=2)
-    estimate = Estimate(
-        map_T_base=measured.map_T_base(map_T_camera),
-        positions=positions,
-        covariance=covariance,
-        seen_sigma=seen_sigma,
-        solved=np.isfinite(covariance[:, 0, 0]),
-        weight=weight,
-        cost_before=found.cost_before,
-        cost_after=optimum.cost_after,
-        iterations=found.iterations,
-        calibration=calibration if calibration is not None and calibration.names else None,
-        noise=None if errors is None else errors.noise,
-        correlated=correlated if tags is None else tags.of_objects(correlated),
-        log_evidence=log_evidence(
-            measured,
-            association,
-            used,
-            np.linalg.norm(seen - origins, axis=1),
-            solved,
-            optimum.cost_after,
-            errors is not None and "ranges" in errors.unknown_noise,
-        ),
-        uncalibrated=failed,
-    )
-    if tags is None:
-        return estimate
-    told = None if calibrated is None else calibrated.sensitivity
-    covariances = partial(joint_covariances, solved)
-    assert measured.tags is not None
-    return with_objects(estimate, measured.tags, rays, map_T_camera, optimum.values, covariances, wider, told, ledger)
+        errors, measure, theta = self.shared
+        return misfit_at_shared_errors(errors, measure, self.association, solution, theta)
+
+    @property
+    def _nothing(self) -> Bools:
+        return np.zeros(len(self.measured.rays), dtype=bool)
+
+    @property
+    def _tolerance(self) -> float:
+        return _TOLERANCE_BEFORE if self.roughly else _TOLERANCE
+
+    @property
+    def _rounds(self) -> int:
+        return _ROUNDS_BEFORE if self.roughly else ROUNDS
 
 
 def _distances(origins: Floats, points: Floats) -> Floats:
     """Return the distances (R,) m of points (R, 3) from origins (R, 3), at least `MIN_DEPTH`."""
     return np.maximum(np.linalg.norm(points - origins, axis=1), MIN_DEPTH)
-
-
-def _weights(loss: Loss, residual: Floats, optimum: Optimum) -> Floats:
-    if loss == "gnc" and optimum.weights is not None:
-        return optimum.weights[: len(residual)]
-    if loss == "huber":
-        return np.minimum(1.0, HUBER_K / np.maximum(residual, 1e-12))
-    if loss == "cauchy":
-        return 1 / (1 + (residual / CAUCHY_K) ** 2)
-    return np.ones(len(residual))
-
-
-def _witnesses(rays: Rays, association: Association, used: Bools) -> Ints:
-    """Return for each object (N,) the keyframe of its middle used ray, or 0 without one."""
-    object_, keyframe = association.object[used], rays.keyframe[used]
-    order = np.lexsort((keyframe, object_))
-    number = np.bincount(object_, minlength=association.count)
-    middle = np.cumsum(number) - number + number // 2
-    witness = np.zeros(association.count, dtype=np.int64)
-    witness[number > 0] = keyframe[order][middle[number > 0]]
-    return witness

@@ -10,6 +10,7 @@ import numpy as np
 from objslam.config import Loss, Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.ground.flattening import LEVEL, raised_points
+from objslam.core.statistics import CAUCHY_K, HUBER_K
 from objslam.core.trace import Trace
 from objslam.errors import SolveError
 from objslam.graph.variables import read_poses, with_points
@@ -41,6 +42,16 @@ class Optimum:
             raise SolveError(
                 "the solve diverged: its cost is not finite", hint="check that the odometry is in metres and radians"
             )
+
+    def ray_weights(self, loss: Loss, residual: Floats) -> Floats:
+        """Return the weights (R,) of rays, which are the first factors. residual: (R,) their residuals, in sigmas."""
+        if loss == "gnc" and self.weights is not None:
+            return self.weights[: len(residual)]
+        if loss == "huber":
+            return np.minimum(1.0, HUBER_K / np.maximum(residual, 1e-12))
+        if loss == "cauchy":
+            return 1 / (1 + (residual / CAUCHY_K) ** 2)
+        return np.ones(len(residual))
 
 
 def build_graph(*groups: Sequence[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:

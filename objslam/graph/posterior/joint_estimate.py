@@ -32,8 +32,8 @@ from objslam.graph.tags.estimate import with_objects
 class SolvedErrors:
     """The shared errors of a joint solve.
 
-    errors: the measurements as a function of them, with the noise that was found. None if there are none. calibration: their
-    values, None without errors. sensitivity: (N, 3, P) of the landmarks, m per unit of each error, NaN for a landmark that is
+    errors: the measurements as a function of them, with the noise that was found. None if there are none. calibration:
+    their values, None without errors. sensitivity: (N, 3, P) of the landmarks, m per unit of each error, NaN for a landmark
     outside the graph. None if the errors were held. failed: whether they could not be estimated.
     """
 
