@@ -22,6 +22,9 @@ _SETTLED = 1e-9
 value leaves positions that the solver would still move. Those of settled landmarks move by 1e-15 m."""
 _PAIRS_AT_ONCE = 1 << 15  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
+_TABLE = 1 << 12
+"""The most entries of a dense table of gains. Up to about this size, as in the frames of a live session, it is faster than a
+sparse one. A larger table of many parts is mostly empty, and its time grows with the cube of its rows."""
 _TOGETHER = 1 << 10
 """The Hungarian method gets parts of frames with about this number of edges at a time. Each call has a fixed cost. With
 a larger number, there are fewer calls, and each takes longer, because the method visits all its rays for each of them."""
@@ -205,10 +208,17 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
     Each row and each column is in at most one pair. row, column, gain: (E,) of the possible pairs, with gains above 0.
     shape: the numbers of rows and columns.
     """
+    from scipy.optimize import linear_sum_assignment
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
     rows, columns = shape
+    if rows * columns <= _TABLE:
+        dense = np.zeros(shape)
+        dense[row, column] = gain
+        first, second = linear_sum_assignment(dense, maximize=True)
+        real = dense[first, second] > 0
+        return first[real], second[real]
     # The sparse method pairs every row. So each row gets an extra column of its own, which means no pair.
     each = np.arange(rows)
     value = np.concatenate([gain, np.zeros(rows)]) + 1.0  # The sparse method ignores entries of 0.

@@ -38,9 +38,8 @@ _SAMPLE = 4096
 _FRAMES = 12
 """The fewest frames that a search uses, because an object is where rays of several frames meet. More frames are slower."""
 _MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have many rays. A larger value costs time.
-_MIN_SUPPORT = (
-    2.5  # The least support of a point. A ray that fits perfectly counts 1. A larger one finds fewer, surer points.
-)
+_MIN_SUPPORT = 2.5
+"""The least support of a point in a search. A ray that fits perfectly counts 1. A larger one finds fewer, surer points."""
 _ABOVE_CHANCE = 3.0
 """The least excess of a point's support over that by stray rays, in standard deviations. A larger one finds surer points."""
 _CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search. A larger one drops weak objects.
@@ -253,6 +252,7 @@ def _plausible(task: _Task, state: State) -> Bools:
 
 
 def _kept(task: _Task, state: State, likely: Floats) -> tuple[State, Floats]:
+    """Return the plausible landmarks, and their probability to exist. likely: (N,) of all landmarks."""
     stays = _plausible(task, state)
     return state.keep(stays), likely[stays]
 

@@ -166,10 +166,12 @@ def main() -> None:
 def _receive(requests: queue.SimpleQueue[bytes]) -> None:
     """Read requests until stdin ends, and then end this process. A session that was killed closes stdin, and does not do
     more."""
-    with os.fdopen(os.dup(sys.stdin.fileno()), "rb") as asked:  # Python waits for the lock of sys.stdin when it ends.
-        while (content := _read(asked)) is not None:
-            requests.put(content)
-    os._exit(0)
+    try:
+        with os.fdopen(os.dup(sys.stdin.fileno()), "rb") as asked:  # Python waits for the lock of sys.stdin when it ends.
+            while (content := _read(asked)) is not None:
+                requests.put(content)
+    finally:  # Without a reader, for example because there is no memory for a request, the session would wait in vain.
+        os._exit(0)
 
 
 if __name__ == "__main__":

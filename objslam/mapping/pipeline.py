@@ -16,7 +16,7 @@ from objslam.mapping.stages.drive import Drive
 from objslam.mapping.stages.measurements import checked, measured
 from objslam.mapping.stages.result import in_known_map, result_of
 from objslam.mapping.stages.second_solve import for_second_solve, reason_to_solve
-from objslam.mapping.stages.solved import refutable, solved, without_refuted_findings, without_solved_errors
+from objslam.mapping.stages.solved import solved, without_refuted_findings, without_solved_errors
 
 
 def run(
@@ -91,7 +91,7 @@ def _run(
     of_solve = _doubting(progress, drive)
     with stage("solve", seconds, of_solve):
         found = solved(drive, frames, rays, earlier, ledger, of_solve)
-    if refutable(found):
+    if found.drive.refutable:
         with stage("checks", seconds, progress):
             found = without_refuted_findings(found, progress)
     found, lasting = completed(without_solved_errors(found, ledger), level=known is None)
@@ -105,7 +105,7 @@ def _run(
 
 def _doubting(progress: Progress, drive: Drive) -> Progress:
     """Return a progress function that also names the findings about the input, if the joint solve may refute them."""
-    if not drive.joint or not drive.diagnosis.refutable:
+    if not drive.refutable:
         return progress
     names = ", ".join(finding.name for finding in drive.diagnosis.findings)
     return lambda stage, done, total: progress(f"{stage} (wrong input? {names})", done, total)

@@ -228,6 +228,7 @@ def test_ranges_in_another_scale_than_the_odometry_stay_wrong(factor, kept):
 def test_halves_are_compared_by_their_fitting_rays():
     late = np.repeat([False, True], 100)
     assert check_halves(late, np.tile(np.arange(100) < 40, 2)) is None
+    assert check_halves(np.zeros(200, dtype=bool), np.arange(200) < 90) is None  # There is no second half.
     differ = check_halves(late, np.concatenate([np.arange(100) < 90, np.arange(100) < 20]))
     assert differ.message.startswith("90 % of the rays fit in the first half of the log, 20 % in the second")
 

@@ -50,11 +50,11 @@ def calibrate_fixed(
 
     The association allows for the present uncertainty of the errors: first their prior, then the covariance of the last fit.
     In rows of equal things, it allows only for the part of the uncertainty that moves rays off their objects. If the errors
-    still change after two associations, the next ones begin with the objects that there are, because searches among all rays
-    take long, and each finds a few other objects. After these have settled, there is one more search. The covariance of the
-    errors is added to the covariance of the objects. Returns the input without the errors, the association, the
-    estimate, and the number of objects in each round. If the errors cannot be estimated, they stay as they were, and the
-    ledger gets a warning.
+    still change after two associations (in rows of equal things, after one), the next ones begin with the objects that there
+    are, because searches among all rays take long, and each finds a few other objects. After these have settled, there is
+    one more search. The covariance of the errors is added to the covariance of the objects. Returns the input without the
+    errors, the association, the estimate, and the number of objects in each round. If the errors cannot be estimated, they
+    stay as they were, and the ledger gets a warning.
     """
     from objslam.graph.calibration.fixed_pose_calibration import (
         calibrate_at_poses,

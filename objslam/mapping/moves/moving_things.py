@@ -129,7 +129,8 @@ def things_at_rest(
     The rays of people who walk through a room meet by chance near some points, because there are many of them. A round of
     association takes each ray by itself. But boxes of images that follow each other show one thing. If it moves, its track
     passes through the object, and the rays before and after belong to no object or to another one. Labels are judged,
-    because tracks of a few things at rest also pass on to equal things beside them. Of a label that moves, objects stay only
+    because tracks of a few things at rest also pass on to equal things beside them. If nearly all rays of a label have an
+    object, its things are at rest. Of a label that moves, objects stay only
     if long tracks show that they are at rest. If all things have one label, the usual scatter is unknown, and all objects
     stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses. known: labels that are known to move. names: the
     labels that are known to be names of things at rest, whose objects stay. along: (N,) objects of things that move, as

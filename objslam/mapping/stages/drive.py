@@ -68,6 +68,11 @@ class Drive:
         return self.settings.mode == "joint"
 
     @property
+    def refutable(self) -> bool:
+        """Whether the solve may refute findings about the input."""
+        return self.joint and self.diagnosis.refutable
+
+    @property
     def both(self) -> bool:
         """Whether the log has a localisation and an odometry."""
         return self.given.localization is not None and self.given.odometry is not None

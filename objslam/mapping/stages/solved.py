@@ -42,7 +42,7 @@ def solved(
     spoilt = diagnosis.spoilt and not drive.joint
     errors = None if spoilt else shared_errors(log, *seen_something(frames, rays), settings)
     of_labels = settings
-    if drive.joint and diagnosis.refutable:
+    if drive.refutable:
         of_labels = with_known_labels(diagnosis, log, rays, settings, progress)
     try:
         solution = solve(frames, rays, drive.cameras, of_labels, ledger, progress, errors=errors, earlier=earlier)
@@ -53,11 +53,6 @@ def solved(
         errors, settings = solution.errors, solution.errors.settings
     before = shared_errors(log, frames, rays, settings) if drive.joint else None
     return SolvedDrive(replace(drive, settings=settings), solution, errors, before)
-
-
-def refutable(found: SolvedDrive) -> bool:
-    """Return whether the solution may refute findings about the input."""
-    return found.drive.joint and found.drive.diagnosis.refutable
 
 
 def without_refuted_findings(found: SolvedDrive, progress: Progress) -> SolvedDrive:
