@@ -162,19 +162,18 @@ def describe_in_map(
     known: PriorMap,
     cameras: tuple[Camera, ...],
     settings: Settings,
-    ids: list[int] | None = None,
+    ids: list[int],
     *,
     trusted: bool = True,
 ) -> tuple[Solution, ObjectMap, Floats]:
     """Return the solution of a drive in the frame of the map, its objects, and the residuals (R,), rad, of its rays.
 
-    ids: (N,) the ids of the objects in the drive, by default 0 to N - 1. trusted: whether positions are reliable.
+    ids: (N,) the ids of the objects in the drive. trusted: whether positions are reliable.
     """
     assert where.solution is not None
     solution = with_bodies(where.solution, cameras, settings)
     objects, residual = describe(solution, cameras, settings, trusted=trusted)
-    if ids is not None:
-        objects = replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
+    objects = replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
     return solution, with_map(objects, where, known), residual
 
 

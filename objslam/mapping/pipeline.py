@@ -66,7 +66,7 @@ def run(
     ledger.restore(before)  # What a run drops counts once.
     ledger.warn(f"{wrong}, so the poses are solved too (--mode fixed keeps them)")
     try:
-        return _run(log, settings.model_copy(update={"mode": "joint"}), ledger, progress, known, found)[0]
+        return _run(log, settings.model_copy(update={"mode": "joint"}), ledger, _of_poses_too(progress), known, found)[0]
     except SolveError as error:  # The map at the given poses is better than none.
         ledger.restore(at_poses)
         ledger.warn(f"{wrong}, but the poses cannot be solved too: {error}")
@@ -104,8 +104,13 @@ def _run(
 
 
 def _doubting(progress: Progress, drive: Drive) -> Progress:
-    """Return a progress function that also names the findings about the input, if the joint solve may refute them."""
+    """Return a progress function that also names the findings about the input, if a test after the solve may refute them."""
     if not drive.refutable:
         return progress
     names = ", ".join(finding.name for finding in drive.diagnosis.findings)
-    return lambda stage, done, total: progress(f"{stage} (wrong input? {names})", done, total)
+    return lambda stage, done, total: progress(f"{stage} (tested after the solve: {names}?)", done, total)
+
+
+def _of_poses_too(progress: Progress) -> Progress:
+    """Return a progress function that says that the stages are those of the second solve."""
+    return lambda stage, done, total: progress(f"poses too, {stage}", done, total)

@@ -16,6 +16,7 @@ from objslam.config import load_settings
 from objslam.errors import SolveError
 from objslam.live.session import finalize
 from objslam.live.session.session import Session
+from objslam.mapping.stages import described
 from objslam.simulation import preset, simulate
 
 ODD, TIMES = 1, 4.0
@@ -28,7 +29,7 @@ def ended():
     made = {}
 
     def noted(name):
-        given = getattr(finalize, name)
+        given = getattr(described, name)
 
         def stage(first, *arguments, **named):
             made[name] = first, given(first, *arguments, **named)
@@ -41,13 +42,13 @@ def ended():
         odd = np.arange(len(objects)) == ODD
         return replace(found, odd=odd, times=np.where(odd, TIMES, found.times))
 
-    find_misfits = finalize.find_misfits
+    find_misfits = described.find_misfits
     settings = load_settings(None, ("mode=joint", "noise.localization=false", *NOTHING_BESIDE))
     session = feed(Session(settings, patient=True).start(), hiding_drive(0, frames=150))
     with pytest.MonkeyPatch.context() as patch:
         for name in ("with_bodies", "with_box_offsets", "describe"):
-            patch.setattr(finalize, name, noted(name))
-        patch.setattr(finalize, "find_misfits", disagreeing)
+            patch.setattr(described, name, noted(name))
+        patch.setattr(described, "find_misfits", disagreeing)
         return session.stop(), made
 
 
@@ -69,6 +70,13 @@ def test_an_object_whose_rays_do_not_agree_has_a_larger_sigma(ended):
         if before.covariance is not None:
             np.testing.assert_allclose(after.covariance, before.covariance * (TIMES**2 if j == ODD else 1.0))
     assert described.objects[ODD].covariance is not None
+
+
+def test_the_map_of_a_session_is_level_as_that_of_a_run():
+    log = simulate(preset("demo", frames=120, objects=12, classes=12, localization=None), 3)
+    settings = load_settings(None, ("mode=joint", "bodies.use=false", *NOTHING_BESIDE))
+    up = feed(Session(settings, patient=True).start(), log).stop().map_T_base[:, :3, 2].mean(axis=0)
+    np.testing.assert_allclose(up / np.linalg.norm(up), [0, 0, 1], atol=1e-9)
 
 
 @pytest.mark.parametrize(("power", "words"), [(0, ""), (-1, "distances along the ray")])

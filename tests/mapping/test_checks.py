@@ -137,11 +137,11 @@ class Heard(Exception):
 
 def test_a_joint_run_says_what_its_solve_tests():
     def hear(stage: str, done: int, total: int) -> None:
-        if "(wrong input? " in stage:
+        if "(tested after the solve: " in stage:
             raise Heard(stage)
 
     log = MISTAKES["image mirrored"](drive("joint"))
-    with pytest.raises(Heard, match=r"^solve \(wrong input\? image "):
+    with pytest.raises(Heard, match=r"^solve \(tested after the solve: image "):
         pipeline.run(log, load_settings(None, (*NOTHING_DRAWN, "mode=joint")), Ledger(), hear)
 
 

@@ -9,10 +9,11 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from objslam.config import Settings
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate
+from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.trajectory import Trajectory, correct_path
 from objslam.core.types import Association, Log
@@ -23,122 +24,114 @@ from objslam.live.calibration.collected import Collected, collect
 from objslam.live.mapper.state import MapState
 from objslam.live.session.input_checks import diagnose_session, with_boxes
 from objslam.mapping.alternation import solve
-from objslam.mapping.bodies.boxes_in_front import with_hidden_parts
-from objslam.mapping.bodies.fitting import with_bodies
-from objslam.mapping.box_offsets import with_box_offsets
-from objslam.mapping.checks.depth_axis import check_depth_axis
 from objslam.mapping.checks.diagnosis import Diagnosis
 from objslam.mapping.checks.finding import Finding
-from objslam.mapping.checks.misfits import find_misfits, with_misfits
-from objslam.mapping.checks.shared_errors import at_bounds
 from objslam.mapping.checks.verdict import say
-from objslam.mapping.contradicting_ranges import with_contradicting_ranges
-from objslam.mapping.corrected import corrected
-from objslam.mapping.describe import describe, make_result, summarise
+from objslam.mapping.describe import make_result, summarise
 from objslam.mapping.joint.doubted_labels import doubted_names
-from objslam.mapping.joint.held_errors import check_turned_camera, with_held_errors
 from objslam.mapping.joint.labels import labels_tell, may_be_by_label
-from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
-from objslam.mapping.moves.near_sides import check_rows
-from objslam.mapping.moves.phantoms import check_neighbours
-from objslam.mapping.refuted import without_refuted
+from objslam.mapping.localization import Localization, PriorMap
 from objslam.mapping.solution import Solution, without_errors
+from objslam.mapping.stages.described import DescribedDrive, completed, described
+from objslam.mapping.stages.drive import Drive
+from objslam.mapping.stages.result import in_known_map, in_map
+from objslam.mapping.stages.solved import SolvedDrive, without_refuted_findings, without_solved_errors
 
 
 def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None = None) -> RunResult:
     """Return the result of a session. Association and solve alternate as in the joint mode, from the session's estimate.
 
     If every label is one object so far, that association is solved. If many of its rays do not fit, the drive is associated
-    again, as in an offline run. If there are more rays than live.reassociate, the session's association is kept.
+    again, as in an offline run. If there are more rays than live.reassociate, the session's association is kept. The stages
+    after the solve are those of an offline run (`mapping/stages`).
 
     name: of the log. journal: its file, None without one. known: a prior map. If the whole drive is found in it, the
     result is in the frame of that map, as in an offline run. SolveError when no box could be mapped.
     """
     begin = time.perf_counter()
-    settings, ledger = m.given, m.counters.ledger
-    found = collect(m, name)
-    errors, log = found.errors, found.log
+    ledger, found = m.counters.ledger, collect(m, name)
     if not len(found.rays):
-        kinds = {"camera": "cameras", "odometry or localisation": "odometry", "detections": "frames"}
-        came = m.counters.accepted()
-        came["odometry"] = came.get("odometry", 0) + came.get("localization", 0)
-        missing = [f"no {what} arrived" for what, kind in kinds.items() if not came.get(kind)]
-        hint = "; ".join(missing + ledger.lines())
-        raise SolveError("no box could be mapped", where=name, hint=hint or None)
+        raise _nothing_mapped(m, name)
+    solved = _solved_drive(found, _checked(m, found, name), m.by_label, ledger)
+    if solved.drive.refutable:
+        solved = without_refuted_findings(solved, _silent)
+    complete, lasting = completed(without_solved_errors(solved, ledger), level=known is None)
+    of, where = described(complete, lasting, None, ledger), None
+    of = replace(of, objects=_with_kept_ids(of.objects, found, of.found.solution.association))
+    if known is not None:
+        of, where = in_known_map(of, known, ledger)
+    return _result(m, of, where, journal, round(time.perf_counter() - begin, 4))
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    """Show no progress, because the session has its own display."""
+
+
+def _nothing_mapped(m: MapState, name: str) -> SolveError:
+    """Return the error of a session without rays. It names what did not arrive, and what was dropped."""
+    kinds = {"camera": "cameras", "odometry or localisation": "odometry", "detections": "frames"}
+    came = m.counters.accepted()
+    came["odometry"] = came.get("odometry", 0) + came.get("localization", 0)
+    missing = [f"no {what} arrived" for what, kind in kinds.items() if not came.get(kind)]
+    hint = "; ".join(missing + m.counters.ledger.lines())
+    return SolveError("no box could be mapped", where=name, hint=hint or None)
+
+
+def _checked(m: MapState, found: Collected, name: str) -> Drive:
+    """Return the drive of a session with the findings about its input. The poses of certainly wrong input are not solved."""
+    settings, ledger, accepted = m.given, m.counters.ledger, m.counters.accepted()
     if m.calibration is not None:
-        warn_of_others(m.calibration, log, settings, ledger)
+        warn_of_others(m.calibration, found.log, settings, ledger)
     recorded = with_boxes(found)
     diagnosis = diagnose_session(recorded, settings, ledger) if settings.checks.use else Diagnosis()
     paths = Log(name, (), odometry=m.course.driven.trajectory(), localization=m.course.localized.trajectory())
     warn_of_two_clocks(paths, settings, ledger)
-    cameras = tuple(one.camera for one in log.cameras)
-    try:
-        if diagnosis.spoilt and log.localization is not None:
-            ledger.warn("the poses are not solved, because a solve cannot correct wrong input")
-            settings = settings.model_copy(update={"mode": "fixed"})
-            solution = solve(found.keyframes, found.rays, cameras, settings, ledger, lambda *_: None)
-        else:
-            solution = _solved(found, m.by_label, cameras, settings, ledger)
-    except SolveError:
-        say(diagnosis, ledger)  # Wrong input is the probable reason.
-        raise
+    if diagnosis.spoilt and found.log.localization is not None:
+        ledger.warn("the poses are not solved, because a solve cannot correct wrong input")
+        settings = settings.model_copy(update={"mode": "fixed"})
     diagnosis = diagnosis.with_findings([_changed(name) for name in sorted(m.changed_cameras)])
-    if diagnosis.refutable and settings.mode == "joint":
-        diagnosis = without_refuted(diagnosis, solution, recorded, settings, lambda *_: None)
-    findings = list(diagnosis.findings)
-    if solution.errors is not None:
-        errors, settings = solution.errors, solution.errors.settings  # It may have more errors, and settings for them.
-        if settings.checks.use:
-            findings += check_turned_camera(errors, solution)
-        solution, log = corrected(with_held_errors(errors, solution, ledger), errors, ledger)
-        cameras = tuple(one.camera for one in log.cameras)
-        if settings.checks.use:
-            findings += at_bounds(solution.estimate, errors.bounds)
-    solution = with_hidden_parts(with_bodies(solution, cameras, settings), cameras)
-    solution = with_box_offsets(solution, cameras, settings)
-    keyframes, estimate = solution.keyframes, solution.estimate
-    used = keyframes, solution.rays, solution.association
-    trusted = not any(finding.spoils for finding in findings)
-    objects, residual = describe(solution, cameras, settings, trusted=trusted)
-    if settings.checks.use:
-        near = check_neighbours(solution, found.errors, settings)
-        depths = check_depth_axis(objects, estimate.map_T_base @ keyframes.base_T_camera, *used)
-        rows = check_rows(solution, tuple(camera.name for camera in cameras), settings)
-        findings += [finding for finding in (near, rows, depths) if finding is not None]
-    say(Diagnosis(tuple(findings)), ledger)
-    objects = with_misfits(objects, find_misfits(objects, *used, residual, estimate.weight, settings))
-    objects = with_contradicting_ranges(objects, estimate.map_T_base @ keyframes.base_T_camera, *used, estimate.weight)
-    ids = _kept_ids(found.association, found.ids, solution.association)
-    objects = replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
-    where = None
-    if known is not None:
-        where = localize(solution, objects, known, errors, settings, ledger)
-        if where.solution is not None and where.map_T_drive is not None:
-            solution, objects, residual = describe_in_map(where, known, cameras, settings, ids, trusted=trusted)
-            log = moved_log(log, where.map_T_drive)
-            keyframes, estimate = solution.keyframes, solution.estimate
-    accepted = m.counters.accepted()
-    counts = {"detection_frames": accepted.get("frames", 0), "frames_on_path": sum(m.frames.values())}
-    counts["detections"] = accepted.get("boxes", 0)
-    seconds = {"finish": round(time.perf_counter() - begin, 4)}
-    summary = summarise(name, journal, counts, settings, ledger, solution, objects, seconds)
+    boxes, frames = accepted.get("boxes", 0), accepted.get("frames", 0)
+    return Drive(recorded, recorded, settings, diagnosis, boxes, frames, chosen=False, clock=None)
+
+
+def _solved_drive(found: Collected, drive: Drive, by_label: bool, ledger: Ledger) -> SolvedDrive:
+    """Return the solution of a drive. by_label: whether every label is one object so far. SolveError if the solve fails."""
+    settings, errors, before = drive.settings, None, found.errors
+    try:
+        if drive.joint:
+            solution, errors = _solved(found, by_label, drive.cameras, settings, ledger), before
+        else:  # As in an offline run, the shared errors of wrong input are not estimated.
+            solution = solve(found.keyframes, found.rays, drive.cameras, settings, ledger, _silent)
+    except SolveError:
+        say(drive.diagnosis, ledger)  # Wrong input is the probable reason.
+        raise
+    if solution.errors is not None:  # It may have more errors, and settings for them.
+        errors, settings = solution.errors, solution.errors.settings
+    return SolvedDrive(replace(drive, settings=settings), solution, errors, before)
+
+
+def _result(m: MapState, of: DescribedDrive, where: Localization | None, journal: Path | None, seconds: float) -> RunResult:
+    """Return the result of a described drive. where: its place in a prior map, None without one. seconds: of the end."""
+    drive, solution, accepted = of.found.drive, of.found.solution, m.counters.accepted()
+    log, settings = drive.log, drive.settings
+    counts = {"detection_frames": drive.frames, "frames_on_path": sum(m.frames.values()), "detections": drive.detections}
+    of_solve = settings, m.counters.ledger, solution, of.objects
     path = log.robot_path
     assert path is not None  # There is no keyframe without a path.
     return make_result(
         solution,
-        objects,
-        residual,
+        of.objects,
+        of.residual,
         summary={
-            **summary,
-            "wrong_input": [finding.to_dict() for finding in findings],
+            **summarise(log.name, journal, counts, *of_solve, {"finish": seconds}),
+            "wrong_input": [finding.to_dict() for finding in drive.diagnosis.findings],
             "live": {**accepted, "rebuilds": m.graph.rebuilds},
-            **({} if where is None else {"localisation": where.told}),
-            **({"map_frame": "map"} if where is not None and where.solution is not None else {}),
+            **in_map(where),
         },
         settings=settings,
-        cameras=cameras,
+        cameras=drive.cameras,
         path=path,
-        path_after=_whole_path(log, keyframes.stamps, estimate.map_T_base),
+        path_after=_whole_path(log, solution.keyframes.stamps, solution.estimate.map_T_base),
     )
 
 
@@ -191,19 +184,21 @@ def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
     return correct_path(way, stamps, before, map_T_base)
 
 
-def _kept_ids(before: Association, ids: Ints, now: Association) -> list[int]:
-    """Return an id for each object of `now`, so that an object has the same id in the snapshots and in the result.
+def _with_kept_ids(objects: ObjectMap, found: Collected, now: Association) -> ObjectMap:
+    """Return the objects so that each has the same id in the snapshots and in the result.
 
-    The objects are paired one to one so that the pairs share the most rays. An object without a partner gets a new id.
-    before: the association of the same rays in the session. ids: (N,) the ids of its objects.
+    The objects are paired one to one with those of the session, so that the pairs share the most rays. An object without a
+    partner gets a new id. now: the association of the session's rays in the solution.
     """
+    before = found.association
     held = (before.object >= 0) & (now.object >= 0)
     cells = before.object[held] * now.count + now.object[held]
     shared = np.bincount(cells, minlength=before.count * now.count).reshape(before.count, now.count)
     pairs = zip(*linear_sum_assignment(shared, maximize=True), strict=True)
-    kept = {int(j): int(ids[i]) for i, j in pairs if shared[i, j] > 0}
-    unused = itertools.count(int(ids.max(initial=-1)) + 1)
-    return [kept[j] if j in kept else next(unused) for j in range(now.count)]
+    kept = {int(j): int(found.ids[i]) for i, j in pairs if shared[i, j] > 0}
+    unused = itertools.count(int(found.ids.max(initial=-1)) + 1)
+    ids = [kept[j] if j in kept else next(unused) for j in range(now.count)]
+    return replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
 
 
 def _solve_joint(found: Collected, settings: Settings, ledger: Ledger) -> Solution:

@@ -1,6 +1,7 @@
 """The last stages of a run: find the drive in an older map, correct its path, and put the result together."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -29,9 +30,17 @@ def in_known_map(of: DescribedDrive, known: PriorMap, ledger: Ledger) -> tuple[D
     where = localize(found.solution, of.objects, known, found.errors, drive.settings, ledger)
     if where.solution is None or where.map_T_drive is None:
         return of, where
-    solution, objects, residual = describe_in_map(where, known, drive.cameras, drive.settings, trusted=of.trusted)
+    ids = [item.id for item in of.objects.objects]
+    solution, objects, residual = describe_in_map(where, known, drive.cameras, drive.settings, ids, trusted=of.trusted)
     moved = replace(drive, log=moved_log(drive.log, where.map_T_drive))
     return replace(of, found=replace(found, drive=moved, solution=solution), objects=objects, residual=residual), where
+
+
+def in_map(where: Localization | None) -> dict[str, Any]:
+    """Return what a summary says of the place of a drive in an older map. where: None if there is no such map."""
+    if where is None:
+        return {}
+    return {"localisation": where.told, **({} if where.solution is None else {"map_frame": "map"})}
 
 
 def result_of(
@@ -70,8 +79,7 @@ def result_of(
             "odometry_clock": None if drive.clock is None else drive.clock.to_dict(),
             "odometry_unused": drive.chosen and drive.both and not drive.joint,
             "wrong_input": [finding.to_dict() for finding in drive.diagnosis.findings],
-            **({} if where is None else {"localisation": where.told}),
-            **({"map_frame": "map"} if where is not None and where.solution is not None else {}),
+            **in_map(where),
         },
         settings=settings,
         cameras=drive.cameras,
