@@ -102,111 +102,129 @@ class _Part:
     residuals: Callable[..., Floats]
 
 
+_Turned = Callable[[Keyframes, Ints | slice], Floats]
+"""Returns the poses (n, 4, 4) of the cameras of some keyframes on their mounts, in the frames of the cameras on the present
+mounts."""
+
+
 def _parts(of: Linearised, mounts: Floats, ranges: Floats) -> tuple[_Part, ...]:
     """Return the kinds of measurements that shared errors may change.
 
     mounts: (P, 4, 4) the present base_T_camera. ranges: (n,) m, the present ranges of the rays.
     """
-    graph, map_T_camera = of.graph, of.map_T_camera
-    (before, after), ranged = graph.moves, graph.ranged
-    seen = graph.seen(map_T_camera, of.positions[of.landmarks])
-    to_landmark = from_origins(graph.rays, seen)
-    axes = graph.bearing_axes(to_landmark)
-    bearing_root, _ = graph.bearing_roots(graph.bearing_residuals(graph.rays.direction, to_landmark, axes))
-    range_ = ranges[ranged]
-    range_root, _ = graph.range_roots(lengths(to_landmark[ranged]))
-    moved = inverse(map_T_camera[before]) @ map_T_camera[after]
-    motion_weight = graph.motion_weights(map_T_camera)
-    floor = of.measured.settings.odometry.floor_xy
-    _, absolute_root, _ = graph.absolute_roots(map_T_camera)
-    some = slice(len(absolute_root))  # The keyframes with an absolute pose.
-    absolute = map_T_camera[some]
-
-    def bearings(direction: Floats, to_landmark: Floats) -> Floats:
-        return bearing_root * graph.bearing_residuals(direction, to_landmark, axes)
-
-    def distances(measured: Floats, to_landmark: Floats) -> Floats:
-        return np.asarray(range_root * (lengths(to_landmark) - measured) / (measured / range_))
-
     from_mounts = inverse(mounts)
 
     def turned(keyframes: Keyframes, which: Ints | slice) -> Floats:
-        """Return the poses (n, 4, 4) of the cameras of some keyframes on their mounts, in the frames of the cameras on the
-        present mounts."""
         return from_mounts[which] @ keyframes.base_T_camera[which]
 
-    def off(measured: Floats, moved: Floats, turned: Floats) -> Floats:
-        # The noise belongs to base. It turns with the camera, or a residual of the heading would make the tilt of the camera
-        # look known: turned by this tilt, it would become a roll of the robot, whose noise is far smaller.
-        return log_se3(turned @ inverse(measured) @ moved @ inverse(turned))
+    return *_of_rays(of, ranges), _of_motions(of, turned), _of_poses(of, turned), _of_tags(of), _of_localizations(of, turned)
 
-    def told(keyframes: Keyframes, rays: Rays, settings: Settings) -> _Inputs:
+
+def _off(measured: Floats, solved: Floats, turned: Floats) -> Floats:
+    """Return how far solved poses or motions (n, 4, 4) of cameras are from the measured ones, as twists (n, 6) of the base.
+
+    The noise belongs to the base. It turns with the camera, or a residual of the heading would make the tilt of the camera
+    look known: turned by this tilt, it would become a roll of the robot, whose noise is far smaller.
+    """
+    return log_se3(turned @ inverse(measured) @ solved @ inverse(turned))
+
+
+def _of_rays(of: Linearised, ranges: Floats) -> tuple[_Part, _Part]:
+    """Return the bearings and the ranges. ranges: (n,) m, the present ranges of the rays."""
+    graph, ranged = of.graph, of.graph.ranged
+    seen = graph.seen(of.map_T_camera, of.positions[of.landmarks])
+    to_landmark = from_origins(graph.rays, seen)
+    axes = graph.bearing_axes(to_landmark)
+    bearing_root, _ = graph.bearing_roots(graph.bearing_residuals(graph.rays.direction, to_landmark, axes))
+    present = ranges[ranged]
+    range_root, _ = graph.range_roots(lengths(to_landmark[ranged]))
+    bearings = _Part(
+        0,
+        lambda _, rays, settings: (rays.direction, rays.offset),
+        lambda _, rays, settings: (rays.direction, from_origins(rays, seen)),
+        lambda direction, to_landmark: bearing_root * graph.bearing_residuals(direction, to_landmark, axes),
+    )
+    distances = _Part(
+        graph.first_range,
+        lambda _, rays, settings: (rays.range[ranged], rays.offset),
+        lambda _, rays, settings: (rays.range[ranged], from_origins(rays, seen)[ranged]),
+        lambda measured, to_landmark: range_root * (lengths(to_landmark) - measured) / (measured / present),
+    )
+    return bearings, distances
+
+
+def _of_motions(of: Linearised, turned: _Turned) -> _Part:
+    """Return the motions by the odometry."""
+    graph, map_T_camera, (before, after) = of.graph, of.map_T_camera, of.graph.moves
+    moved = inverse(map_T_camera[before]) @ map_T_camera[after]
+    weight, floor = graph.motion_weights(map_T_camera), of.measured.settings.odometry.floor_xy
+
+    def inputs(keyframes: Keyframes, rays: Rays, settings: Settings) -> _Inputs:
         if not len(before) or keyframes.odom_T_base is None:
             return ()
         return keyframes.odom_T_base, keyframes.base_T_camera, np.array(settings.odometry.floor_xy)
 
-    def said(keyframes: Keyframes, rays: Rays, settings: Settings) -> tuple[Floats, ...]:
+    def measured(keyframes: Keyframes, rays: Rays, settings: Settings) -> tuple[Floats, ...]:
         if not len(before) or keyframes.odom_T_base is None:
             return ()
         odom_T_camera = keyframes.odom_T_base @ keyframes.base_T_camera
         way = np.array(settings.odometry.floor_xy / floor)
         return inverse(odom_T_camera[before]) @ odom_T_camera[after], way, turned(keyframes, after)
 
-    def motions(motion: Floats, way: Floats, turned: Floats) -> Floats:
-        twist = off(motion, moved, turned) / np.repeat([1.0, float(way)], 3)
-        return motion_weight[:, None] * np.einsum("kij,kj->ki", graph.motion_roots, twist)
+    def residuals(motion: Floats, way: Floats, turned: Floats) -> Floats:
+        twist = _off(motion, moved, turned) / np.repeat([1.0, float(way)], 3)
+        return weight[:, None] * np.einsum("kij,kj->ki", graph.motion_roots, twist)
 
-    def poses(measured: Floats, turned: Floats) -> Floats:
-        return np.einsum("kij,kj->ki", absolute_root, off(measured, absolute, turned))
+    return _Part(graph.first_motion, inputs, measured, residuals)
 
-    (squares, *others), landmarks = graph.further, of.positions[of.landmarks]
+
+def _of_poses(of: Linearised, turned: _Turned) -> _Part:
+    """Return the absolute poses."""
+    graph = of.graph
+    _, root, _ = graph.absolute_roots(of.map_T_camera)
+    some = slice(len(root))  # The keyframes with an absolute pose.
+    solved = of.map_T_camera[some]
+    return _Part(
+        graph.first_motion + 6 * len(graph.moves[0]),
+        lambda keyframes, _, settings: (keyframes.map_T_base[some], keyframes.base_T_camera[some]),
+        lambda keyframes, _, settings: (
+            keyframes.map_T_base[some] @ keyframes.base_T_camera[some],
+            turned(keyframes, some),
+        ),
+        lambda measured, turned: np.einsum("kij,kj->ki", root, _off(measured, solved, turned)),
+    )
+
+
+def _of_tags(of: Linearised) -> _Part:
+    """Return the sides of fiducials."""
+    (squares, *_), landmarks, tags = of.graph.further, of.positions[of.landmarks], of.measured.tags
 
     def sides(keyframes: Keyframes, rays: Rays, settings: Settings) -> tuple[Floats, ...]:
-        tags = of.measured.tags
         return () if tags is None else (squares.sized(tags.sized(rays.label_names, settings)).side,)
 
+    return _Part(of.graph.first_further, sides, sides, lambda side: squares.by_sides(landmarks, side))
+
+
+def _of_localizations(of: Linearised, turned: _Turned) -> _Part:
+    """Return the motions between localised poses."""
+    squares, *others = of.graph.further
     localized = next((one for one in others if isinstance(one, LocalizedRows)), None)
 
-    def between(keyframes: Keyframes, rays: Rays, settings: Settings) -> tuple[Floats, ...]:
+    def measured(keyframes: Keyframes, rays: Rays, settings: Settings) -> tuple[Floats, ...]:
         if localized is None:
             return ()
         poses = keyframes.map_T_camera
         motion = inverse(poses[localized.of.before]) @ poses[localized.of.after]
         return motion, turned(keyframes, localized.of.after)
 
-    def localized_motions(motion: Floats, turned: Floats) -> Floats:
+    def residuals(motion: Floats, turned: Floats) -> Floats:
         assert localized is not None
-        twist = off(motion, localized.moved(map_T_camera), turned)
-        return np.einsum("kij,kj->ki", localized.weighted_roots(map_T_camera), twist)
+        twist = _off(motion, localized.moved(of.map_T_camera), turned)
+        return np.einsum("kij,kj->ki", localized.weighted_roots(of.map_T_camera), twist)
 
-    return (
-        _Part(
-            0,
-            lambda _, rays, settings: (rays.direction, rays.offset),
-            lambda _, rays, settings: (rays.direction, from_origins(rays, seen)),
-            bearings,
-        ),
-        _Part(
-            graph.first_range,
-            lambda _, rays, settings: (rays.range[ranged], rays.offset),
-            lambda _, rays, settings: (rays.range[ranged], from_origins(rays, seen)[ranged]),
-            distances,
-        ),
-        _Part(graph.first_motion, told, said, motions),
-        _Part(
-            graph.first_motion + 6 * len(before),
-            lambda keyframes, _, settings: (keyframes.map_T_base[some], keyframes.base_T_camera[some]),
-            lambda keyframes, _, settings: (
-                keyframes.map_T_base[some] @ keyframes.base_T_camera[some],
-                turned(keyframes, some),
-            ),
-            poses,
-        ),
-        _Part(graph.first_further, sides, sides, lambda side: squares.by_sides(landmarks, side)),
-        _Part(
-            graph.first_further + squares.rows_each * len(squares.tag),
-            lambda keyframes, _, settings: () if localized is None else (keyframes.map_T_base, keyframes.base_T_camera),
-            between,
-            localized_motions,
-        ),
+    return _Part(
+        of.graph.first_further + squares.rows_each * len(squares.tag),
+        lambda keyframes, _, settings: () if localized is None else (keyframes.map_T_base, keyframes.base_T_camera),
+        measured,
+        residuals,
     )
