@@ -199,8 +199,9 @@ class Joint(Section):
     max_rounds: Count = 6
     """Maximum number of rounds of association and solving. The rounds stop early if no ray changes its object."""
     max_solves: Count = 150
-    """Maximum number of solves in the search for the map of a log without names and without a localisation. After it, no
-    other start, path or loop is tried. Searches that ended with right maps took up to 121 solves."""
+    """Maximum number of solves in the search for the map of a log without names. After it, no other start, path or loop is
+    tried, and no other object as a false one. Searches that ended with right maps took up to 121 solves. A smaller number
+    ends sooner."""
     max_iterations: Count = 100
 
 

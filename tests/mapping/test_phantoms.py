@@ -14,6 +14,7 @@ from objslam.core.types import Association, Log
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import joint_solve, pipeline
 from objslam.mapping.checks.finding import NEIGHBOURS
+from objslam.mapping.joint.joint_alternation import Effort
 from objslam.mapping.moves import phantoms
 from objslam.mapping.moves.phantoms import BENT, check_neighbours
 from objslam.simulation import DriveSettings, PoseNoise, simulate
@@ -119,6 +120,17 @@ def test_no_object_is_tried_where_the_path_search_is_too_coarse(begun, monkeypat
         monkeypatch.setattr(phantoms, "_COARSE", -np.inf)
     phantoms.without_phantoms(begun)
     assert len(tried) == (0 if coarse else 8)
+
+
+@pytest.mark.parametrize("left", [0, 5, 1000])
+def test_the_search_ends_with_the_solves_of_the_run(begun, monkeypatch, left):
+    """A user limits the time of a run by `joint.max_solves`. The verdict says that the search was not finished."""
+    tried, without = [], phantoms._without
+    monkeypatch.setattr(phantoms, "_without", lambda state, j: tried.append(j) or without(state, j))
+    most = begun.settings.joint.max_solves
+    found = phantoms.without_phantoms(replace(begun, effort=Effort(most - left)))
+    assert found.unfinished == (left < 1000)
+    assert (len(tried) == 0) if left == 0 else (0 < len(tried) < 8) if left == 5 else (len(tried) >= 8)
 
 
 def test_a_good_localisation_takes_no_time_for_phantoms(monkeypatch):

@@ -291,8 +291,8 @@ def _check(e: Evidence) -> list[str]:
         )
     if e.unfinished:
         found.append(
-            "The search for a map that explains the boxes took all its solves (joint.max_solves), and the best map is still "
-            "unclear. Depths, more labels or a better odometry would help."
+            "The search for a map that explains the boxes ended after its solves (joint.max_solves), so the best map may be "
+            "wrong. Depths, more labels or a better odometry would help."
         )
     if e.copied:
         found.append(

@@ -153,8 +153,7 @@ class JointState:
         state, before, earlier, states = self, self, dict[bytes, Self](), [] if self.estimate is None else [self]
         held = False  # Whether the last solve held the shared errors.
         for number in range(self.settings.joint.max_rounds):
-            solves = f"{self.effort.solves} of at most {self.settings.joint.max_solves} solves"
-            self.progress(f"association, round {number + 1} ({solves})", 0, 0)
+            self.progress(f"association, round {number + 1}, after {self.effort.solves} solves", 0, 0)
             found = state.associated(map_T_base, guess, rough=not state.rounds)
             state, key = state.counted(found), found.object.tobytes()
             same = state.rounds[-1]["rays_changed"] == 0

@@ -135,7 +135,8 @@ def without_phantoms(state: JointState) -> JointState:
     explains the log better, the object is a phantom. The phantom whose loss explains the log best is dropped, and the other
     phantoms are tried again. The shared errors and the noise are fixed in these trials. The first trial keeps all objects.
     If its path is much worse, the path search is too coarse for the log (`_COARSE`), and nothing else is tried. If it is
-    better, the other trials begin there.
+    better, the other trials begin there. After `joint.max_solves` solves, nothing else is tried, and the state is
+    unfinished.
     """
     assert state.association is not None
     best = replace(state.attempt(), hold=state.errors is not None)
@@ -148,9 +149,12 @@ def without_phantoms(state: JointState) -> JointState:
     tried = _candidates(state)
     assert best.estimate is not None
     tried = tried[np.isfinite(best.estimate.positions[tried, 0])]
-    while len(tried):
+    while len(tried) and not best.spent:
         found, phantoms = best, list[int]()
         for number, j in enumerate(tried.tolist()):
+            if best.spent:
+                phantoms += tried[number:].tolist()
+                break
             state.progress("phantoms", number, len(tried))
             other = _without(best, j)
             if other is not None and other.explained > best.explained:
@@ -159,14 +163,15 @@ def without_phantoms(state: JointState) -> JointState:
         best, tried = found, np.array(phantoms, dtype=np.int64)
         assert best.estimate is not None
         tried = tried[np.isfinite(best.estimate.positions[tried, 0])]
+    unfinished = len(tried) > 0
     if best is begin:
-        return state
+        return replace(state, unfinished=unfinished)
     assert best.association is not None
     assert best.estimate is not None
     guess = best.association, best.estimate.positions
     # Without an association, the first round is solved also if it agrees with the guess, which still lists the phantoms.
     rounds = replace(best, hold=state.hold, association=None).alternated(best.estimate.map_T_base, guess)
-    return state.better(rounds)
+    return replace(state.better(rounds), unfinished=unfinished)
 
 
 def _candidates(state: JointState) -> Ints:
