@@ -213,7 +213,10 @@ def _apart(f: Filter, one: Ints, two: Ints) -> Floats:
 
 
 def _carried(arm: Floats) -> Floats:
-    """Return the derivative (P, 3, 3) of points by yaw, x and y of the base. arm: (P, 3) m, their offsets from the base."""
+    """Return the derivatives (P, 3, 3) of points that move with the base, by its yaw, x and y.
+
+    arm: (P, 3) m, the offsets of the points from the base, along the axes of the map.
+    """
     moved = np.zeros((len(arm), 3, POSE))
     moved[:, 0, 0], moved[:, 1, 0], moved[:, 0, 1], moved[:, 1, 2] = -arm[:, 1], arm[:, 0], 1.0, 1.0
     return moved

@@ -23,8 +23,8 @@ _BENT, _BENT_PER_M = 0.07, 0.02
 """The deformation of a neighbourhood: a constant (m), and a part per metre from the pivot. Larger values accept pairs that
 fit less well."""
 _MARGIN = 2.0
-"""The margin (m) around the landmarks that is part of the area for their density. With a larger margin, landmarks count as
-sparser, so a match is more evidence."""
+"""The density of landmarks refers to the rectangle around all landmarks, with this margin (m) on each side. With a larger
+margin, landmarks count as sparser, so a match is more evidence."""
 _REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis and of its assignment. Few are enough from a close start.
 _CANDIDATES = 3000
 """The most pairs of a landmark `here` and a landmark `there` that are tried. Two pairs form a hypothesis. A larger number

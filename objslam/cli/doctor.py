@@ -97,7 +97,7 @@ def _solved(log: Log, settings: Settings, show: Progress) -> list[dict[str, Any]
 def _show_trials(found: Diagnosis) -> None:
     """Print how well the boxes fit: with the log as it is, and with the corrections (hypotheses) that make them fit best.
 
-    If nothing is wrong, one line is enough.
+    If there is no finding, or nothing was compared, print one line instead of the table.
     """
     from rich.table import Table
 

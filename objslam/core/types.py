@@ -34,11 +34,12 @@ class Detections:
 
     frame_stamps: (F,) s, strictly increasing. frame: (M,) index into frame_stamps, non-decreasing. boxes: (M, 4) x1, y1, x2,
     y2 in px of the raw (distorted) image. label: (M,) index into label_names. scores: (M,) in [0, 1]. depths: (M,) z along
-    the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: True if no box is cut off at the image's edge,
-    as with fiducials, because a detector needs all their corners. Then box centres are valid up to the edge. corners:
-    (M, 4, 2) px of the raw image, the corners of a square fiducial in its own order, NaN for another box. None if no box has
-    corners. features: (M, D) unit appearance vectors, a row of NaN for a box without one. None if no box has one. second:
-    (M,) the label of a box that was dropped because it lies on this one, -1 or None without one. ValueError if a shape, an
+    the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: whether the image's edge cuts off
+    no box. This is so for fiducials, because a detector must see all their corners. If it is True, the centres of boxes at
+    the edge are valid too. corners: (M, 4, 2) px of the raw image, the corners of a square fiducial in its own order, NaN
+    for another box. None if no box has corners. features: (M, D) unit appearance vectors, a row of NaN for a box without
+    one. None if no box has one. second: (M,) index into label_names, the label of a box that was dropped because it lay on
+    this box. It is -1 for a box on which no other box lay, and None if no box has such a label. ValueError if a shape, an
     index or the order is wrong.
     """
 

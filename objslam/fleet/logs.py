@@ -21,7 +21,7 @@ _LOG_MARKS = {mark for source in SOURCES for mark in source.marks}
 _BAGS = (".bag", ".mcap", ".db3")
 """The endings of ROS bags. Each may be followed by .zstd or .zst."""
 _BAG_FOLDER = "metadata.yaml"
-"""The file that makes all bags of a folder one recording."""
+"""If a folder with bags has this file of rosbag2, it is one log: all its bags belong to one recording."""
 
 
 @dataclass(frozen=True, slots=True)

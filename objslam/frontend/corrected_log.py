@@ -23,10 +23,10 @@ _AHEAD = np.array([[0.0, 0.0, 1.0]])  # The direction along which depths are mea
 
 
 def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log:
-    """Return the log corrected by known errors: odometry, cameras, and stamps and depths of frames.
+    """Return the log without known errors: its odometry, its cameras, and the stamps and depths of its frames are corrected.
 
-    error: values by name, as in `Calibration`. An absent name is 0. stay: whether frames on the path stay on it (see
-    `later`). If False, a clock offset may move frames beyond an end of the path.
+    error: the value of each error by its name, as in `Calibration`. An error that is absent is 0. stay: whether a clock
+    offset leaves frames on the path (see `later`). If it is False, the offset may move frames beyond an end of the path.
     """
     path, odometry = log.robot_path if stay else None, log.odometry
     if odometry is not None:

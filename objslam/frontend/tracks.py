@@ -13,10 +13,11 @@ _NEAR = np.radians(6.0)
 """The largest angle (rad) between a ray and the ray before it in its track, turned by the odometry. A thing beside the robot
 moves by 5 degrees if the robot drives 8 % of its distance between the images. A larger angle joins neighbours more often."""
 _MISS = 5.0
-"""If ranges show where things are, the way of the robot is predicted too, and rays of one track hardly miss each other. The
-largest angle of a link is then this multiple of the median miss, at most `_NEAR`. The median was 0.3 to 0.5 degrees in
-buildings, 0.9 on rough ground, and 2 for a robot that sways on its legs. Recorded posts stand 17 cm apart, in groups: with 6
-degrees, 27 % of the links joined neighbours, and with 3 degrees 20 %. A larger multiple joins neighbours more often."""
+"""The largest angle of a link by ranges, as a multiple of the median miss. The angle is at least `_LEAST_MISS` and at most
+`_NEAR`. A range shows where a thing is. So it is known how the thing shifts in the image as the robot drives, and rays of
+one track hardly miss each other. The median miss was 0.3 to 0.5 degrees in buildings, 0.9 on rough ground, and 2 for a robot
+that sways on its legs. Some recorded posts stand in groups, 17 cm apart. With a largest angle of 6 degrees, 27 % of the
+links joined neighbours there, and with 3 degrees 20 %. A larger multiple joins neighbours more often."""
 _LEAST_MISS = np.radians(3.0)
 """The largest angle (rad) of a link by ranges is at least this. Where wheels slip, rays miss each other by more than usual,
 and the tracks must go on there. With 2 degrees, the path of a simulated hotel was bent by 4 m at a slip, and with 3 degrees

@@ -109,7 +109,7 @@ class _Exploration:
         self.taught = _LESSON  # The number of rays with a landmark from which the ratio was learnt last.
 
     def run(self, progress: Callable[[int, int], None]) -> InitialEstimate:
-        """Explore all keyframes."""
+        """Explore all keyframes, and return the initial estimate. progress(done, total): gets numbers of keyframes."""
         end = 1
         while end < len(self.keyframes):
             begin, end = end, self._end(end)

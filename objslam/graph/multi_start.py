@@ -30,7 +30,8 @@ drives, the second start ended in the minimum of the first. With fewer rays than
 minimum in 7 of 59 parts, and with more rays in 2 of 71. A larger number makes logs of some minutes slower."""
 _SAME = 0.1
 """Two solutions are in one minimum if no landmark differs by more than this share of the size of the map. In wrong minima of
-real drives, some landmark differs by a third of it or more. A larger share compares fewer solutions."""
+real drives, at least one landmark differs by a third of the map's size or more. With a larger share, more solutions count as
+equal, so fewer are compared."""
 _MOST_RAYS = 6000
 """Logs with more rays begin at one graph only. They are drives of more than a quarter of an hour, which see landmarks again
 and again, and no wrong minimum was found in them. A larger number makes long logs slower."""

@@ -55,7 +55,7 @@ def read_detections(path: Path, ledger: Ledger) -> Detections:
     if not collector.stamps:
         if not lines:
             hint = "write the boxes into it, or remove it and run a detector on the images of rgb.txt (--detector)"
-            raise LogError("no detection frame in it", where=str(path), hint=hint)
+            raise LogError("the file has no detection frame", where=str(path), hint=hint)
         why = f": {reasons.most_common(1)[0][0]}" if reasons else ""
         hint = "the file is one JSON list: write one frame a line" if lines[0][1].startswith("[") else _EXAMPLE
         raise LogError(f"none of its {len(lines)} lines is a detection frame{why}", where=str(path), hint=hint)

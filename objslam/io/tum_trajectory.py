@@ -59,7 +59,10 @@ def read_pose_table(path: Path, ledger: Ledger) -> Table:
     off = np.abs(lengths(table.values[:, 4:]) - 1) > 0.01
     if off.any():
         first = f"{path}:{table.lines[off][0]}"
-        ledger.warn(f"{first}: {int(off.sum())} quaternions are not of length 1: are the columns tx ty tz qx qy qz qw?")
+        ledger.warn(
+            f"{first}: the length of this quaternion is not 1 ({int(off.sum())} in all), so it is normalised. Check that "
+            f"the columns are {_COLUMNS}"
+        )
     return table
 
 

@@ -26,10 +26,10 @@ _CLEAR = 0.98
 other starts, which takes time. Of 15 simulated robots, right maps had 0.983 and more, and most maps with doubles at most
 0.963. A bent map of a real robot, with ranges, had 0.976."""
 _NOISIER = 1.5, 2.5
-"""The largest factors on the noise of rays of a clear map: of one that only one start found, and of one that another start
-found too. Rays that have wrong objects make it large: 3.6 and 12 in simulated maps with doubles. Boxes that sit beside the
-things by a share of their sizes do so too: 1.5 to 1.8 in right maps. With smaller factors, more logs are tried from other
-starts."""
+"""The largest factors on the noise of rays of a clear map. The first factor is for a map that only one start found. The
+second is for a map that another start found too. Rays with wrong objects make the noise large: the factor was 3.6 and 12 in
+simulated maps with doubles. Boxes that lie beside their things by a share of the size of the thing make it large too: the
+factor was 1.5 to 1.8 in right maps. With smaller factors, more logs are tried from other starts."""
 
 _AT_REST = 0.9
 """If the map of a known start has objects for less than this share of the boxes of tracks, the others show things that move.

@@ -21,11 +21,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RangeShift:
-    """The corrections of R ranges from the surfaces of bodies to their centres. A range is corrected if its body is more
-    informative than the width of its box.
+    """The corrections that make R ranges end at the centres of bodies instead of on their surfaces.
 
-    factor: (R,) on the range. bias: (R,) on `Rays.range_bias`. Both are 1 where nothing is known. surface: (R, 2) the new
-    `Rays.surface`, NaN where nothing is known.
+    A range is corrected if a body shows how far the centre of its object is behind the surface (`range_shift`).
+
+    factor: (R,) the factor on the range. bias: (R,) the factor on `Rays.range_bias`. Both are 1 for a range that is not
+    corrected. surface: (R, 2) the new `Rays.surface`, NaN for a range that is not corrected.
     """
 
     factor: Floats

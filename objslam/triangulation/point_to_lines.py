@@ -132,8 +132,10 @@ def _places(bundle: Bundle) -> int:
 
 
 def _closed_form(origin: Tensor, direction: Tensor, weight: Tensor, xp: ModuleType) -> tuple[Tensor, Tensor]:
-    """Return the points (3, B) of `least_squares` for the B objects of a block of lines, and which points are unique
-    (B,)."""
+    """Return the points (3, B), m, of `least_squares` for the B objects of a block, and which of the points are unique (B,).
+
+    origin: (3, n, B) m. direction: (3, n, B) unit. weight: (n, B), 1 for a ray and 0 for a filler.
+    """
     number = weight.sum(axis=0)
     base = (origin * weight).sum(axis=1) / number  # Large map coordinates would cost digits.
     # One projection is exact enough for squared distances.

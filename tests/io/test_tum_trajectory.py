@@ -41,7 +41,7 @@ def test_a_pose_is_read_as_tum_writes_it(tmp_path):
     path = read_trajectory(file, ledger)
     assert path.stamps.tolist() == [1341847980.79]
     np.testing.assert_allclose(path.poses[0], [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-15)
-    assert f"{file}:2: 1 quaternions are not of length 1" in ledger.warnings[0]
+    assert f"{file}:2: the length of this quaternion is not 1 (1 in all)" in ledger.warnings[0]
 
 
 TURNED = [[0.0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 0], [0, 0, 0, 1]]  # a quarter turn to the left at (3, 4)

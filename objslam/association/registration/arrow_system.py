@@ -91,7 +91,10 @@ class ArrowSystem:
         return system, back
 
     def _rows(self, s: int) -> tuple[Ints, Floats]:
-        """Return the coordinates (3 n,) of the n objects that map `s` measured, and their blocks (3 n, w) with the map."""
+        """Return the rows (3 n,) of the n objects that map `s` measured, and the parts of `pull` (3 n, w) in these rows.
+
+        A row is an index into the 3 N coordinates of all objects.
+        """
         mine = np.flatnonzero(self.map == s)
         at = (3 * self.object[mine, None] + np.arange(3)).reshape(-1)
         return at, self.pull[mine].reshape(len(at), self.maps.shape[1])

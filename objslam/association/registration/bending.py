@@ -106,8 +106,11 @@ def near(problem: Problem, moved: Floats) -> tuple[Ints, Ints]:
 
 
 def _assigned(problem: Problem, moved: Floats, own: Floats) -> Ints:
-    """Return the best pairs (P, 2) of objects of a and of b, one to one. moved, own: (N, 3) m, (N, 3, 3) m^2, places and own
-    errors of the objects of a."""
+    """Return the pairs (P, 2) of objects of a and of b, one to one, that together have the least cost (see `bent_matches`).
+
+    moved: (N, 3) m, the places of the objects of a in the frame of b. own: (N, 3, 3) m^2, the covariances of the errors that
+    each of them has alone.
+    """
     one, two = near(problem, moved)
     miss = problem.b.position[two] - moved[one]
     squared = (miss * np.linalg.solve(own[one] + problem.b.own[two], miss[..., None])[..., 0]).sum(axis=1)

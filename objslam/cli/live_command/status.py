@@ -63,7 +63,10 @@ class _Rates:
         self._before: tuple[float, dict[str, int]] = (time.monotonic(), {})
 
     def line(self, snapshot: Snapshot, ledger: Ledger, width: int | None = None) -> str:
-        """Return the status line. width: of the terminal, in characters, None if there is none."""
+        """Return the status line, with rates since the last call.
+
+        width: the width of the terminal in characters. If it is None, no part of the line is left out.
+        """
         now, then, before = time.monotonic(), *self._before
         self._before = (now, snapshot.counters)
         rates: dict[str, float] = {

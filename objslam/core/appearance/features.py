@@ -81,7 +81,7 @@ def vector_of_entry(entry: Mapping[str, Any]) -> Floats32 | None:
         return None
     numbers = isinstance(value, list) and all(type(x) in (int, float) and abs(x) < 2 for x in value)
     if not numbers or not 0 < len(value) <= MAX_FEATURES or abs(np.linalg.norm(value) - 1) >= _UNIT:
-        raise ValueError("features must be a vector of length 1")
+        raise ValueError(f"features must be a list of at most {MAX_FEATURES} numbers whose squares add up to 1")
     return np.array(value, dtype=np.float32)
 
 

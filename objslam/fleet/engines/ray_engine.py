@@ -19,7 +19,8 @@ from objslam.fleet.engines.local_engine import Answer, Engine, attempt
 from objslam.fleet.engines.worker import Limits, Worker
 
 _QUEUED = 2
-"""The tasks that are submitted for each CPU of the cluster. A larger number keeps more tasks ready for a free CPU."""
+"""The number of tasks in flight for each CPU of the cluster, if the caller does not set their number. A larger number keeps
+more tasks ready for a free CPU."""
 _PATIENT = 10.0
 """How long the address of a cluster may take to accept a connection, s. A larger value waits longer for a wrong address."""
 _GB = 1e9

@@ -138,7 +138,11 @@ def _way(keyframes: Keyframes, number: Ints) -> Floats:
 
 
 def _motions(keyframes: Keyframes, number: Ints, parts: tuple[Parts, ...]) -> LocalizedMotions:
-    """Return the motions between consecutive keyframes of `number` (n,). parts: the six standard deviations."""
+    """Return the motions between consecutive keyframes of `number` (n,).
+
+    parts: the standard deviations of roll, pitch, yaw (rad), x, y, z (m) in the frame of the base. Each is one number for
+    all motions, or has one number for each motion (n-1,).
+    """
     poses, before, after = keyframes.map_T_camera, number[:-1], number[1:]
     s = np.stack([np.broadcast_to(np.square(part), len(before)) for part in parts], axis=1) / sharing(keyframes)
     spread = _in_camera(keyframes.base_T_camera[after], np.minimum(s, _UNTOLD**2))

@@ -165,7 +165,7 @@ def _in_words(ratio: float, than: str, *, spoils: bool = True) -> Finding:
     return Finding(
         _SCALE,
         f"the depths are {100 * abs(ratio - 1):.0f} % too {'long' if ratio > 1 else 'short'} for {than}: "
-        "the scale of the depth (depth_scale), of the poses, or the focal length is wrong",
+        "the scale of the depths (depth_scale), the scale of the poses, or the focal length is wrong",
         spoils=spoils,
     )
 

@@ -29,8 +29,8 @@ _CELL = 1.0
 """The length (s) of the shortest cell. The rays of an object in one cell count as one ray. A longer time is faster, and sees
 shorter errors as noise."""
 _MOST_CELLS = 48
-"""The most cells of an object. The cells of an object that was seen for long are longer. A larger number is finer and
-slower."""
+"""The most cells of an object. If an object was seen for so long that it would have more cells, the length of its cells is
+doubled until they are few enough. A larger number gives shorter cells and is slower."""
 _LARGE = 1.0
 """A run at given poses warns of errors of the poses that last for seconds, if they are at least this multiple of the noise
 `localization`. At 1, the lasting errors alone are as large as all errors together should be. A larger value warns less

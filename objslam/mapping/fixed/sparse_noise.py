@@ -43,8 +43,9 @@ _SURE = 60.0
 """From this lead on, the boxes agree, even if they seem to disagree because each thing has only few boxes. With a larger
 lead, more right streets with few boxes are called wrong."""
 _BETTER = 40.0
-"""The least lead, in log odds, of a usual mistake over the log as it is. A straight street looks alike in a mirror, so a
-corrected mistake leads by up to 25 by chance. With a larger lead, mistakes are sooner taken for noise."""
+"""The input counts as wrong if the log with a usual mistake corrected leads the log as it is by this or more, in log odds. A
+straight street looks like its mirror image. So the correction of a mistake that is not there leads by up to 25, by chance.
+With a larger value, mistakes are sooner taken for noise."""
 _MOST_VIEWS = 12.0
 """The most boxes that an object may have on average. The streets have 4. If objects with more boxes still disagree, wrong
 input is likelier than noise, because their frames would show the noise. With a larger number, a turned camera is sooner

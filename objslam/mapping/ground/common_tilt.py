@@ -249,8 +249,10 @@ def _of_all(inner: Floats, told: Floats) -> _Solved:
 
 
 def _positive(pivots: Floats) -> Floats:
-    """Return the pivots of a factorisation. SolveError if one is not a positive number, because 1 + A is positive definite
-    for all finite rays."""
+    """Return the pivots of the factorisation of 1 + A (`_Solved`). SolveError if a pivot is not finite and positive.
+
+    If all rays are finite, 1 + A is positive definite, and its pivots are positive.
+    """
     if not (np.isfinite(pivots) & (pivots > 0)).all():
         raise SolveError("the errors that the rays of a pose share are not finite")
     return pivots

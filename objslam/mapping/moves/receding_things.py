@@ -86,13 +86,15 @@ def things_along_the_view(
 
 
 def moving_along(sights: Sights, place: float) -> tuple[Bools, Floats]:
-    """Return which things (N,) move along the view, and how far (N,) m they seem to move within seconds.
+    """Return which things (N,) move along the view, and the longest way (N,), m, that each seems to move in one view.
 
-    A view moves if a point with a constant velocity explains its rays and ranges far better than a point at rest. It must
-    also move along the view by more than a surface can. A thing moves if most of its rays are in such views. The noise of
-    single ranges is the scatter of the label about moving points. So ranges through a table, which jump to the floor behind
-    it, are noisy, and ranges to people are not. The ranges of a view may share an error, and a few of them may be wrong. A
-    thing that was seen at its place on another visit, and rested there, does not move.
+    A view moves under two conditions. A point with a constant velocity explains its rays and ranges far better than a point
+    at rest. This point moves along the view by more than the surface of a thing at rest can explain. A thing moves if most
+    of its rays are in such views. A thing that rests in at least one of its visits does not move.
+
+    The noise of single ranges is the scatter of the ranges of a label about moving points. Some ranges pass through a table
+    and end on the floor behind it. So the ranges of tables are noisy, and the ranges of people who walk are not. The ranges
+    of a view may share an error, and a few of them may be wrong.
 
     place: m, the standard deviation of the places of the robot.
     """

@@ -23,9 +23,11 @@ _OUTWARD_GAIN = 0.05  # The gain, px, for each px away from the mean of all dots
 def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -> tuple[Floats, Bools]:
     """Place labels one by one. The labels of the most crowded dots come first. All lengths are in px.
 
-    Each label gets the cheapest of a fixed set of candidate positions around its dot. There it must lie inside `frame`, and
-    must not cover a dot or an earlier label. These raise the cost: distance from the dot, covered points of `avoid`, another
-    dot that is nearer, a leader line that crosses something.
+    Each label has a fixed set of candidate positions around its dot, and gets the cheapest free one. A position is free if
+    the label lies inside `frame` and covers no dot and no earlier label. A label without a free position is not placed. The
+    cost grows with the distance from the dot, and with the number of points of `avoid` that the label covers. It also grows
+    if another dot is nearer to the label than its own dot, and with each line, label or dot that its leader line crosses.
+    Positions away from the middle of all dots cost less.
 
     Args:
         anchors: (N, 2) the dots.

@@ -39,8 +39,8 @@ _LUMINANCES = (0.09, 0.17)
 either luminance has a contrast of at least 4.5 on white (WCAG 2.1)."""
 _CORE, _AROUND = 0.1, 1.5
 """The limits of the shown area of a map without a path. The box of the objects leaves out the share `_CORE` of the objects
-on each side. A picture shows objects up to `_AROUND` times the box's diagonal away from the box. A larger `_CORE` hides more
-far objects. A larger `_AROUND` hides fewer."""
+on each side. A picture shows all objects up to `_AROUND` times the box's diagonal away from the box, or farther if `_FENCE`
+says so. A larger `_CORE` hides more far objects. A larger `_AROUND` hides fewer far objects."""
 _KNOWN_HEADING, _LONGER = np.radians(15), 2.0
 """A picture shows the corners of a cuboid under two conditions. The standard deviation of its yaw is below `_KNOWN_HEADING`
 (rad). Its length exceeds its width by more than `_LONGER` standard deviations of their difference. With 15 degrees, an error
@@ -128,7 +128,10 @@ def _between(turn: int) -> float:
 
 
 def object_colours(objects: ObjectMap) -> list[tuple[float, float, float]]:
-    """Return a colour for each object. The first object of a label has the label's colour, the others have nearby hues."""
+    """Return a colour for each object, as red, green and blue in [0, 1].
+
+    The first object of a label has the label's colour. The others have nearby hues.
+    """
     slots = _slots([o.label for o in objects.objects])
     shared, earlier = Counter(o.label for o in objects.objects), Counter[str]()
     colours = []

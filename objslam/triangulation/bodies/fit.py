@@ -197,10 +197,11 @@ def sums_of_products(body: Ints, one: Floats, other: Floats, count: int) -> Floa
 
 
 def _cost(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> Floats:
-    """Return half the weighted sum of squares (N,) of each body, with its prior. All weights are fixed, the robust weights
-    too.
+    """Return the cost (N,) of each body: half the weighted sum of squares of its residuals and of its prior.
 
-    A bound that a step crosses counts at once, so that no step jumps back and forth across it.
+    weight: (B, 5), fixed during a step, also its robust part. now: the residuals at `values`. An edge that is a bound counts
+    only while the body does not reach it, and `now.use` says this for `values`. So the cost of a step shows at once that the
+    body has crossed a bound, and the steps do not jump back and forth across it.
     """
     off = values - prior.mean
     own = np.bincount(body, (weight * now.use * now.value**2).sum(axis=1), len(values))

@@ -24,10 +24,11 @@ _LATCHED = (
 
 
 def _dump(content: Content) -> bytes:
-    """Return the content of the file.
+    """Return the content of the MCAP file. OutputError if the stamps of the path lie before 1970 or after 2038.
 
-    The resolved objects with their covariances, the markers and the path have one message each, at the first stamp. The
-    robot's pose has a message at each stamp of the path. Each chunk has a CRC.
+    One message has all resolved objects with their covariances, one has all markers, and one has the whole path. These three
+    messages have the first stamp of the path. A further message at each stamp of the path has the robot's pose. Each chunk
+    has a CRC.
     """
     from mcap.writer import CompressionType, Writer
 
