@@ -11,7 +11,7 @@ from objslam.mapping.doubts.find import mostly_doubtful
 from objslam.mapping.fixed.map_at_poses import MapAtPoses
 from objslam.mapping.localization import PriorMap
 from objslam.mapping.progress import Progress, stage
-from objslam.mapping.stages.described import completed, described
+from objslam.mapping.stages.described import mapped
 from objslam.mapping.stages.drive import Drive
 from objslam.mapping.stages.measurements import checked, measured
 from objslam.mapping.stages.result import in_known_map, result_of
@@ -94,11 +94,13 @@ def _run(
     if found.drive.refutable:
         with stage("checks", seconds, progress):
             found = without_refuted_findings(found, progress)
-    found, lasting = completed(without_solved_errors(found, ledger), level=known is None)
-    of, where = described(found, lasting, earlier, ledger), None
+    found = without_solved_errors(found, ledger)
+    of, where = mapped(found, earlier, ledger, level=known is None), None
     if known is not None:
         with stage("localize", seconds, progress):
             of, where = in_known_map(of, known, ledger)
+        if where.solution is None and found.drive.joint:  # It stays in its own frame, as without an older map.
+            of = mapped(found, earlier, ledger, level=True)
     result = result_of(of, where, frames, seconds, ledger, progress)
     return result, reason_to_solve(of, result), for_second_solve(of, result)
 

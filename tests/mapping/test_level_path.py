@@ -11,8 +11,10 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.result import RunResult
 from objslam.core.types import Log
 from objslam.mapping import pipeline
+from objslam.mapping.localization import PriorMap
 from objslam.simulation import preset, simulate
 
+CHANGES = ("output.recording=false", "poses.use=odometry", "mode=joint", "checks.use=false")
 PITCH = 0.03  # rad, by which the camera looks up while the robot starts
 
 
@@ -28,8 +30,7 @@ def drive(pitch: float) -> Log:
 
 
 def mapped(log: Log) -> RunResult:
-    changes = ("output.recording=false", "poses.use=odometry", "mode=joint", "checks.use=false")
-    return pipeline.run(log, load_settings(None, changes), Ledger())
+    return pipeline.run(log, load_settings(None, CHANGES), Ledger())
 
 
 def slope(result: RunResult, other: RunResult) -> float:
@@ -52,3 +53,13 @@ def test_a_tilt_at_the_start_does_not_tilt_the_map() -> None:
     assert tilted.origins == pytest.approx(origins)
     assert tilted.directions == pytest.approx(directions)
     assert np.nanmedian(tilted.residual) < np.radians(0.5)  # Rays still meet at their objects.
+
+
+def test_a_drive_that_is_not_in_the_older_map_is_level_too() -> None:
+    log = drive(PITCH)
+    settings = load_settings(None, (*CHANGES, "bodies.use=false"))
+    elsewhere = pipeline.run(simulate(preset("demo", frames=100), 5), load_settings(None, CHANGES), Ledger())
+    result = pipeline.run(log, settings, Ledger(), known=PriorMap("elsewhere", elsewhere.map))
+    assert not result.summary["localisation"]["localised"]
+    up = result.map_T_base[:, :3, 2].mean(axis=0)
+    assert up / np.linalg.norm(up) == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)

@@ -13,10 +13,9 @@ from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate
-from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.trajectory import Trajectory, correct_path
-from objslam.core.types import Association, Log
+from objslam.core.types import Log
 from objslam.errors import SolveError
 from objslam.frontend.known_errors import warn_of_others
 from objslam.frontend.localization.odometry_clock import warn_of_two_clocks
@@ -32,7 +31,7 @@ from objslam.mapping.joint.doubted_labels import doubted_names
 from objslam.mapping.joint.labels import labels_tell, may_be_by_label
 from objslam.mapping.localization import Localization, PriorMap
 from objslam.mapping.solution import Solution, without_errors
-from objslam.mapping.stages.described import DescribedDrive, completed, described
+from objslam.mapping.stages.described import DescribedDrive, mapped
 from objslam.mapping.stages.drive import Drive
 from objslam.mapping.stages.result import in_known_map, in_map
 from objslam.mapping.stages.solved import SolvedDrive, without_refuted_findings, without_solved_errors
@@ -55,11 +54,12 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
     solved = _solved_drive(found, _checked(m, found, name), m.by_label, ledger)
     if solved.drive.refutable:
         solved = without_refuted_findings(solved, _silent)
-    complete, lasting = completed(without_solved_errors(solved, ledger), level=known is None)
-    of, where = described(complete, lasting, None, ledger), None
-    of = replace(of, objects=_with_kept_ids(of.objects, found, of.found.solution.association))
+    solved = without_solved_errors(solved, ledger)
+    of, where = _with_kept_ids(mapped(solved, None, ledger, level=known is None), found), None
     if known is not None:
         of, where = in_known_map(of, known, ledger)
+        if where.solution is None and solved.drive.joint:  # It stays in its own frame, as without a prior map.
+            of = _with_kept_ids(mapped(solved, None, ledger, level=True), found)
     return _result(m, of, where, journal, round(time.perf_counter() - begin, 4))
 
 
@@ -184,13 +184,13 @@ def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
     return correct_path(way, stamps, before, map_T_base)
 
 
-def _with_kept_ids(objects: ObjectMap, found: Collected, now: Association) -> ObjectMap:
-    """Return the objects so that each has the same id in the snapshots and in the result.
+def _with_kept_ids(of: DescribedDrive, found: Collected) -> DescribedDrive:
+    """Return the map with the ids of the session, so that an object has the same id in the snapshots and in the result.
 
     The objects are paired one to one with those of the session, so that the pairs share the most rays. An object without a
-    partner gets a new id. now: the association of the session's rays in the solution.
+    partner gets a new id.
     """
-    before = found.association
+    before, now = found.association, of.found.solution.association
     held = (before.object >= 0) & (now.object >= 0)
     cells = before.object[held] * now.count + now.object[held]
     shared = np.bincount(cells, minlength=before.count * now.count).reshape(before.count, now.count)
@@ -198,7 +198,8 @@ def _with_kept_ids(objects: ObjectMap, found: Collected, now: Association) -> Ob
     kept = {int(j): int(found.ids[i]) for i, j in pairs if shared[i, j] > 0}
     unused = itertools.count(int(found.ids.max(initial=-1)) + 1)
     ids = [kept[j] if j in kept else next(unused) for j in range(now.count)]
-    return replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
+    numbered = tuple(replace(item, id=j) for item, j in zip(of.objects.objects, ids, strict=True))
+    return replace(of, objects=replace(of.objects, objects=numbered))
 
 
 def _solve_joint(found: Collected, settings: Settings, ledger: Ledger) -> Solution:

@@ -46,7 +46,18 @@ class DescribedDrive:
     noisy: Finding | None = None
 
 
-def completed(found: SolvedDrive, *, level: bool) -> tuple[SolvedDrive, LastingNoise | None]:
+def mapped(found: SolvedDrive, earlier: MapAtPoses | None, ledger: Ledger, *, level: bool) -> DescribedDrive:
+    """Return the map of a solved drive, in the frame of the drive.
+
+    earlier: the map at the given poses, if this solve follows it. level: whether the path of a joint solve is turned until
+    it is level. It is not turned while a place in an older map is sought. The ledger warns of what the checks of the map
+    find.
+    """
+    complete, lasting = _completed(found, level=level)
+    return _described(complete, lasting, earlier, ledger)
+
+
+def _completed(found: SolvedDrive, *, level: bool) -> tuple[SolvedDrive, LastingNoise | None]:
     """Return the drive with the bodies of its objects, and with the covariances that solves do not contain.
 
     level: whether the path of a joint solve is turned until it is level. The second value is the size of the errors of given
@@ -68,12 +79,12 @@ def completed(found: SolvedDrive, *, level: bool) -> tuple[SolvedDrive, LastingN
     return replace(found, solution=with_box_offsets(solution, cameras, settings)), lasting
 
 
-def described(
+def _described(
     found: SolvedDrive, lasting: LastingNoise | None, earlier: MapAtPoses | None, ledger: Ledger
 ) -> DescribedDrive:
     """Return the map of a completed drive, with the findings of the checks of the map. The ledger warns of them.
 
-    lasting: from `completed`. earlier: the map at the given poses, if this solve follows it.
+    lasting: from `_completed`. earlier: the map at the given poses, if this solve follows it.
     """
     drive = found.drive
     trusted = not drive.diagnosis.spoilt
