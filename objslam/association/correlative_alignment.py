@@ -17,8 +17,8 @@ _FINE_TURN, _FINE_SHIFT = np.radians(0.4), 0.04  # The finest grid steps (rad, m
 _LANDMARK_SIGMA = 0.03
 """The assumed standard deviation (m) of a landmark's position. A larger value accepts rays farther from landmarks."""
 _MIN_LEVEL = 0.1
-"""The heading noise of a ray is its noise divided by the cosine of its elevation, which is taken as at least this. A larger
-value trusts steep rays more."""
+"""The least cosine of a ray's elevation that is used. The heading noise of a ray is its noise divided by this cosine. A
+larger value trusts steep rays more."""
 _AT_ONCE = 2_000_000  # The most distances computed together. A larger value needs more memory.
 _MOST_RANGE_COST = 9.0
 """The most that a range adds to a cost, in squared deviations. Some ranges are wrong. A larger value trusts ranges more."""
@@ -40,8 +40,8 @@ def align(
     (N, 3) m and (N,) of the landmarks. centre: (3,) m, the point about which a correction turns. spread: (3,) standard
     deviations of the last correction in x, y (m) and yaw (rad). They define its prior and bound the grid. share: (K,) the
     variance of the drift at each pose, as a share of its variance at the last pose. The same share of the last correction is
-    expected at the pose. alike: (R, N) the log odds that each ray shows each landmark, from its appearance. None if this is
-    not known.
+    expected at the pose. alike: (R, N) the log odds that each ray shows each landmark, from the appearance of its box. None
+    if these are not known.
     """
     x, y = (_steps(sigma, _FINE_SHIFT, _MOST_SHIFTS) for sigma in spread[:2])
     shifts, turns = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), _steps(spread[2], _FINE_TURN, _MOST_TURNS)
@@ -72,9 +72,9 @@ def align(
 class _Lines:
     """R rays, seen from above.
 
-    offset: (R, 2) m, where each ray begins, from the point about which a correction turns. heading, sigma: (R,) rad, its
-    direction, and the noise of this. range, range_sigma: (R,) m, the horizontal part of its range, NaN if unknown, and the
-    noise of this. share: (R,) the share of the correction that its pose gets.
+    offset: (R, 2) m, where each ray begins, from the point about which a correction turns. heading, sigma: (R,) rad, the
+    direction of the ray and its noise. range, range_sigma: (R,) m, the horizontal part of the range, NaN if unknown, and its
+    noise. share: (R,) the share of the correction that the pose of the ray gets.
     """
 
     offset: Floats
@@ -102,7 +102,7 @@ class _Lines:
 def _reachable(lines: _Lines, target: Floats, shifts: Floats, turns: Floats, gain: Floats) -> Bools:
     """Return which rays and landmarks (R, N) may cost less than a stray ray under a shift (S, 2), m, and a turn (T,), rad.
 
-    target: (N, 3) m, the landmarks relative to the centre. gain: (R, N) lowers the cost of each pair.
+    target: (N, 3) m, the landmarks relative to the centre. gain: (R, N) the amount by which each pair costs less.
     """
     between = target[:, :2] - lines.offset[:, None]
     distance = np.maximum(np.hypot(between[..., 0], between[..., 1]), 1e-6)
@@ -118,8 +118,8 @@ def _reachable(lines: _Lines, target: Floats, shifts: Floats, turns: Floats, gai
 def _misfit(lines: _Lines, target: Floats, shifts: Floats, turns: Floats, gain: Floats) -> Floats:
     """Return the cost (S, T, P) of pairs of a ray and a landmark under each shift (S, 2), m, with each turn (T,), rad.
 
-    target: (P, 3) m, the landmark of each pair, relative to the centre. gain: (P,) lowers the cost of each pair. The sine of
-    the angle between a ray and its landmark stands for the angle, because this takes a fifth of the time.
+    target: (P, 3) m, the landmark of each pair, relative to the centre. gain: (P,) the amount by which each pair costs less.
+    The sine of the angle between a ray and its landmark replaces the angle, because the sine takes a fifth of the time.
     """
     turned = turns[:, None] * lines.share
     cos, sin = np.cos(turned), np.sin(turned)

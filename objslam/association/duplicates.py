@@ -6,11 +6,13 @@ from objslam.association.observations import overlap
 from objslam.core.arrays import Bools, Floats, Ints
 
 _ONE_THING = 1 / 3
-"""Two boxes of one label and frame may show one thing if their intersection over union is at least this. Equal boxes with
-this value cover half of each other. The suppression of detectors leaves second boxes below 0.45 to 0.7. Things side by side
-have 0, and a thing behind another has more from a few places only. With a larger value, second boxes become objects."""
+"""The least intersection over union of two boxes of one label and frame that may show one thing. Two boxes of equal size
+with this value cover half of each other. The suppression of detectors leaves second boxes below 0.45 to 0.7. Things side by
+side have 0. A thing behind another thing has a larger value from a few places only. With a larger value, second boxes become
+objects."""
 TOGETHER = 0.03
-"""Objects that are seen together in more than this share of frames differ. With a larger share, different objects merge."""
+"""The largest share of the rarer object's frames that may show both objects if the two are one thing. With a larger share,
+different objects merge."""
 
 
 def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, Ints, Floats]:
@@ -23,8 +25,8 @@ def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, In
 
 
 def seen_as_two(together: int, frames: int) -> bool:
-    """Return whether two objects differ. frames: how many frames show the rarer object. together: how many show both
-    objects."""
+    """Return whether two objects differ. frames: the number of frames that show the rarer object. together: the number of
+    frames that show both objects."""
     return together > TOGETHER * frames
 
 

@@ -25,9 +25,9 @@ _LEAST_DISTANCE = 1e-3
 
 @dataclass
 class Filter:
-    """The state of the filter. map_T_base: (4, 4). shared: (S,) errors that all motions share. position: (N, 3) m of
-    landmarks. covariance: (D, D) with D = 3 + S + 3 N. Its order is yaw, x and y, then the shared errors, then the
-    positions."""
+    """The state of the filter. map_T_base: (4, 4) the pose of the base. shared: (S,) errors that all motions share.
+    position: (N, 3) m of landmarks. covariance: (D, D) with D = 3 + S + 3 N. Its order is yaw, x and y, then the shared
+    errors, then the positions."""
 
     map_T_base: Floats
     shared: Floats
@@ -54,8 +54,9 @@ class Filter:
 
 @dataclass(frozen=True)
 class Sight:
-    """R rays relative to the base. offset: (R, 3) m, the origins, and direction: (R, 3), in the base frame. sigma: (R,) rad.
-    range, range_sigma: (R,) m, NaN if unknown."""
+    """R rays relative to the base. offset: (R, 3) m, the origins in the base frame. direction: (R, 3) unit, in the base
+    frame. sigma: (R,) rad, the noise of the directions. range, range_sigma: (R,) m, the ranges and their noise, NaN if
+    unknown."""
 
     offset: Floats
     direction: Floats
@@ -74,8 +75,8 @@ class Expected:
     """P pairs of a ray and a landmark, with the difference between the measured and the expected ray.
 
     residual: (P, 3), two components across the ray (rad), and one for the range (m), which is 0 without a range. by_pose,
-    by_landmark: (P, 3, 3) the Jacobians of the expected ray. variance: (P, 3) of the measurements. Without a range, the last
-    variance is 1 / (2 pi), so that it multiplies the likelihood by 1. ranged: (P,) whether there is a range.
+    by_landmark: (P, 3, 3) the Jacobians of the expected ray. variance: (P, 3) the variances of the measurements. Without a
+    range, the last variance is 1 / (2 pi), so that it multiplies the likelihood by 1. ranged: (P,) whether there is a range.
     """
 
     landmark: Ints
@@ -190,8 +191,8 @@ def differences(f: Filter, one: Ints, two: Ints) -> tuple[Floats, Floats]:
 
 
 def joint_differences(f: Filter, one: Ints, two: Ints, sigma: float) -> tuple[Floats, Floats]:
-    """Return the offsets (P, 3) m of `differences`, and their joint covariance (P, 3, P, 3). sigma: m, an additional
-    error."""
+    """Return the offsets (P, 3) m of `differences`, and their joint covariance (P, 3, P, 3). sigma: m, the standard
+    deviation of an additional error of each coordinate."""
     jacobian = _apart(f, one, two)
     total = jacobian @ f.covariance @ jacobian.T
     total[np.diag_indices(len(total))] += sigma**2

@@ -13,30 +13,30 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.statistics import grouped_quantiles, log_beta, logistic, poisson_tail
 
 _PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.
-_CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations. Larger values mean similar rates.
+_CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations. With larger ones, rates vary less.
 _UNUSUAL_SHARE = 0.05
-"""The share of objects that are detected more rarely than their class, because neighbours hide them on one visit, or one of
-their sides is hard to detect. With a larger share, misses drop fewer objects, and more phantoms stay."""
+"""The share of objects that are detected more rarely than their class. Neighbours hide such an object on one visit, or one
+of its sides is hard to detect. With a larger share, misses drop fewer objects, and more phantoms stay."""
 _UNUSUAL_RATE = (0.6, 12.0)
 """The detection rates of objects that are detected more rarely (`_UNUSUAL_SHARE`) have a beta distribution. The first number
 is its mean, as a share of the rate of the class: about a half, as for a thing that is hidden on one visit of two. The second
 number is its concentration. With a larger mean, misses drop more objects."""
 _SHARED_RAYS = 0.5
-"""A landmark may be detected more rarely than its class only if at most this share of its rays also passes another landmark
-of the label. With a larger share, fewer neighbours are dropped, and more phantoms stay."""
+"""The largest share of a landmark's rays that may also pass another landmark of the label, if the landmark may be detected
+more rarely than its class. With a larger share, fewer neighbours are dropped, and more phantoms stay."""
 _CLEAR_LEAD = 5.0  # A concentration this far below the best, in ln likelihood, is excluded. A larger lead excludes fewer.
 _POOLED_BOXES = 100.0  # With this many boxes, a class's own rate weighs as much as the rate of all classes.
 _RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.
-_MOST_PRIOR = 3.0  # The largest prior odds. A class with few boxes has them. A larger value keeps more weak objects.
+_MOST_PRIOR = 3.0  # The largest prior odds, as for a class with few boxes. A larger value keeps more weak objects.
 _EXPECTED_STRAYS = 5.0  # Each class is assumed to have this number of stray boxes in addition to the observed ones.
 _LOG_SIZE = 0.7  # The standard deviation of ln size within a class. It is a factor of 2 in size.
 _PHANTOM_LOG_RANGE = 4.6  # The width of the uniform ln size distribution of phantoms. It is a factor of 100 in size.
 _MOST_ODDS = 20.0  # The largest absolute log odds against chance. This limit only keeps them finite.
 _REST_PRIOR = 3.0  # The prior log odds of a static object over a moving one. A larger value drops fewer objects.
 _WITHIN_SIZE = 0.5  # The share of an object's size that its apparent motion may have, because box centres wander that far.
-_DRIFTED = 2.0  # An object may seem to move by this many standard deviations of the drift of the path. More drops fewer.
+_DRIFTED = 2.0  # An object may seem to move by this number of standard deviations of the path's drift. More drop fewer.
 _WITHIN_NOISE = 8.0
-"""Poses that err for seconds may make a thing at rest seem to move by up to this number of standard deviations of a ray. In
+"""The largest apparent motion of a thing at rest, in standard deviations of a ray. Poses that err for seconds cause it. In
 simulations with errors of 2 s, things at rest seemed to move by up to 8, and people who walk by 30. With a larger number,
 more things that move become objects."""
 _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test.
@@ -44,10 +44,10 @@ _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test
 
 @dataclass(frozen=True)
 class Rates:
-    """Beta distributions of the detection rates in each class. mean: (L,) of each class. concentration: the sum of the two
-    parameters of a distribution, the same for all classes. With several concentrations (C, 1), results get a first axis
-    (C,). overall: the mean of all classes. untold: (L,) the probability that the rate of a class does not tell the rate of
-    one of its objects, so that the object has a rate like the objects of all classes."""
+    """Beta distributions of the detection rates in each class. mean: (L,) the mean rate of each class. concentration: the
+    sum of the two parameters of a distribution, the same for all classes. With several concentrations (C, 1), results get a
+    first axis (C,). overall: the mean rate of all classes. untold: (L,) the probability that the rate of a class does not
+    tell the rate of one of its objects, so that the object has a rate like the objects of all classes."""
 
     mean: Floats
     concentration: float | Floats
@@ -67,7 +67,7 @@ class Rates:
         """Return the log likelihood ratio (N,) of an object of the class over a phantom, from the detections and misses.
 
         An object has a rate of its class or, with the probability `untold`, a rate of all classes. With the probability
-        `_UNUSUAL_SHARE`, it has a lower one. rarer: (N,) whether it may have a lower one.
+        `_UNUSUAL_SHARE`, its rate is lower. rarer: (N,) whether the rate of each object may be lower.
         """
         phantom, (lower, rarer_concentration) = self.mean * _PHANTOM_SHARE, _UNUSUAL_RATE
         # With the concentration 1 / phantom the density of phantom rates decreases from 0 on.
@@ -80,7 +80,7 @@ class Rates:
         of = history.seen, history.expected, label
         as_phantom, of_class, of_all, unusual = _beta_binomial(*of, rates, concentrations)
         untold = np.broadcast_to(self.untold, self.mean.shape)[label]
-        with np.errstate(divide="ignore"):  # ln(0): the rate of the class tells nothing, or everything.
+        with np.errstate(divide="ignore"):  # ln(0) if `untold` is 0 or 1.
             usual = np.logaddexp(np.log1p(-untold) + of_class, np.log(untold) + of_all)
         usual = np.log1p(-_UNUSUAL_SHARE) + usual
         unusual = np.where(rarer, np.log(_UNUSUAL_SHARE), -np.inf) + unusual
@@ -92,9 +92,9 @@ def detection_rates(history: DetectionHistory, label: Ints, labels: int, told: b
     of all classes. The concentration is the lowest one whose likelihood is not clearly below the highest likelihood. In this
     likelihood, any object may be a phantom.
 
-    The boxes of one object tell nothing about the differences between objects of its class. So the more objects a class
-    has, the less likely is it that its rate does not tell the rate of an object (`untold`). label: (N,) of the objects.
-    labels: the number L of all labels. told: whether the rate of a class always tells that of its objects."""
+    The boxes of one object tell nothing about the differences between objects of its class. So the probability `untold` is
+    smaller for a class with more objects. label: (N,) of the objects. labels: the number L of all labels. told: whether the
+    rate of a class always tells the rates of its objects, so that `untold` is 0."""
     seen, expected = history.seen.astype(float), history.expected
     own = seen / np.maximum(expected, 1)
     overall = _weighted_median(own, seen, np.zeros(len(seen), dtype=np.int64), 1)
@@ -109,8 +109,8 @@ def detection_rates(history: DetectionHistory, label: Ints, labels: int, told: b
 
 def _beta_binomial(seen: Ints, expected: Ints, label: Ints, rate: Floats, concentration: float | Floats) -> Floats:
     """Return ln of the probability (..., N) of a sequence of detections and misses, if the rate has a beta distribution.
-
-    label: (N,) of the objects. rate, concentration: (..., L) the mean rate of each class, and the sum of the two parameters.
+    label: (N,) the class of each object. rate, concentration: (..., L) the mean rate of each class, and the sum of the two
+    parameters.
     """
     a, b = concentration * rate, concentration * (1 - rate)
     counted = [a[..., label] + seen, a], [b[..., label] + expected - seen, b]
@@ -119,7 +119,8 @@ def _beta_binomial(seen: Ints, expected: Ints, label: Ints, rate: Floats, concen
 
 
 def _weighted_median(values: Floats, weight: Floats, group: Ints, count: int) -> Floats:
-    """Return the weighted median (count,) of each group: half of the weight lies below it. It is 0 without weight."""
+    """Return the weighted median (count,) of each group: half of the weight lies below the median. The median is 0 for a
+    group without weight."""
     result = np.zeros(count)
     order = np.lexsort((values, group))
     total = np.cumsum(weight[order])
@@ -184,8 +185,8 @@ def chance_odds(state: State, gate: float) -> Floats:
 def beyond_chance(state: State, gate: float, least: float) -> Bools:
     """Return which landmarks (N,) have `chance_odds` of at least a value.
 
-    More frames that look at a landmark lower its odds. If even all frames would not lower them enough, nobody needs to know
-    which frames look at it. That takes most of the time otherwise.
+    The odds of a landmark are lower if more frames look at it. If the odds are high enough even with all frames, the frames
+    that look at the landmark are not determined. To determine them takes most of the time.
     """
     surely = _odds_of_share(state, _gate_area(state, gate) / (state.view.solid_angle * state.obs.scale)) >= least
     return surely if surely.all() else chance_odds(state, gate) >= least
@@ -241,11 +242,11 @@ def rest_odds(state: State, fitted: int = 0) -> Floats:
     """Return the log odds (N,), at most 0, of a static point over a point with constant velocity.
 
     Rays of a slow object may meet for a while, but a moving point explains them much better. BIC gives the odds from the
-    share of the squared deviations that a velocity explains. Errors of poses last for seconds, so they look like a motion
-    too. If they can explain the distance that the point moved, only the part of the deviations beyond their nominal noise
-    counts. A box centre wanders over its object as the view changes, which also looks like motion. So only a few rays count.
-    Motion within the size of the object, or within the drift of the path, does not count. fitted: the number of measured
-    coordinates that a moving point explains even by chance. They matter if there are few rays.
+    share of the squared deviations that a velocity explains. Errors of poses last for seconds, so they also look like a
+    motion. If these errors can explain the distance that the point moved, only the part of the deviations beyond their
+    nominal noise counts. A box centre wanders over its object as the view changes, which also looks like motion. So only a
+    few rays count. Motion within the size of the object, or within the drift of the path, does not count. fitted: the number
+    of measured coordinates that a moving point explains even by chance. This number matters if there are few rays.
     """
     obs, landmarks = state.obs, state.landmarks
     stamps = state.view.stamps[obs.frame[state.assigned]]
@@ -261,7 +262,7 @@ def rest_odds(state: State, fitted: int = 0) -> Floats:
 
 
 def _drift_at(state: State) -> Floats:
-    """Return how far (N,) m, one standard deviation, the path drifts at each landmark from its first ray to its last.
+    """Return the standard deviation (N,) m of the path's drift at each landmark, from its first ray to its last.
 
     The drift between two frames is a small rotation and shift (phi, rho) in map. It moves a point p by rho + phi x p.
     """

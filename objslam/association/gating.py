@@ -18,23 +18,24 @@ _ALTERNATIONS = 3  # The most alternations after a change. A larger value conver
 _FAR = 1e6
 """The distance (m) from the first camera beyond which only parallel rays meet. A larger distance keeps farther landmarks."""
 _SETTLED = 1e-9
-"""If no position moves by more than this (m), and no noise factor changes by more, a refinement changed nothing. A larger
-value leaves positions that the solver would still move. Those of settled landmarks move by 1e-15 m."""
+"""The largest change of a position (m) and of a noise factor that counts as no change in a refinement. A larger value leaves
+positions that the solver would still move. The positions of settled landmarks move by 1e-15 m."""
 _PAIRS_AT_ONCE = 1 << 15  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
 _TABLE = 1 << 12
-"""The most entries of a dense table of gains. Up to about this size, as in the frames of a live session, it is faster than a
-sparse one. A larger table of many parts is mostly empty, and its time grows with the cube of its rows."""
+"""The most entries of a dense table of gains. Up to about this size, as in the frames of a live session, a dense table is
+faster than a sparse one. A larger table of many parts is mostly empty, and its time grows with the cube of its rows."""
 _TOGETHER = 1 << 10
-"""The Hungarian method gets parts of frames with about this number of edges at a time. Each call has a fixed cost. With
-a larger number, there are fewer calls, and each takes longer, because the method visits all its rays for each of them."""
+"""The number of edges that one call of the Hungarian method gets, about. A call gets several parts of frames. Each call has
+a fixed cost. With a larger number, there are fewer calls. Each takes longer, because the method visits all rays for each
+ray."""
 
 
 @dataclass(frozen=True)
 class Edges:
     """Possible matches (E,), sorted by ray, then by landmark. deviation: squared deviation of the bearing, in variances (2
-    degrees of freedom). vague: 2 ln of the ratio of two areas in the image: the area where the landmark may appear, and the
-    area of the ray's own noise. cost: deviation + vague + the cost of the range."""
+    degrees of freedom). vague: 2 ln of a ratio of two areas in the image. They are the area where the landmark may appear,
+    and the area of the ray's own noise. cost: deviation + vague + the cost of the range."""
 
     ray: Ints
     landmark: Ints
@@ -93,7 +94,8 @@ def _relative_covariance(to: Floats, landmark: Floats, pose: Floats | None) -> F
 def _deviations(direction: Floats, to: Floats, own: Floats, covariance: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the deviation (E,) and the vagueness (E,) of `Edges`, and the variance (E,) m^2 of the landmark along the ray.
 
-    direction: (E, 3). to: (3, E) m. own: (E,) m^2, the ray's own variance. covariance: (E, 3, 3) m^2 of the landmark.
+    direction: (E, 3) unit, of the ray. to: (3, E) m, from the camera to the landmark. own: (E,) m^2, the variance of the ray
+    alone. covariance: (E, 3, 3) m^2 of the landmark.
     """
     axes = tangent_basis(direction)
     x, y = np.einsum("eij,je->ie", axes, to)
@@ -188,8 +190,8 @@ def _best_of_each(one: Ints, other: Ints, gain: Floats, part: Ints) -> tuple[Int
     """Return the best edge of each value of `one`, and (E,) whether each edge is in a part without conflicts.
 
     one, other: (E,) the ray and the landmark in the frame of each edge, or the reverse. In a part without conflicts, no two
-    best edges share a value of `other`. Then they are the best assignment of the part. Of equal gains, the first edge wins,
-    whose landmark has the lowest index.
+    best edges share a value of `other`. Then they are the best assignment of the part. If gains are equal, the first edge
+    wins. Its landmark has the lowest index.
     """
     order = np.argsort(one * len(one) + np.arange(len(one)))
     first = np.flatnonzero(np.diff(one[order], prepend=-1))
@@ -299,7 +301,7 @@ def alternate(
         position = refine(obs, held, matched[held], old.position, old.noise)
         same = np.array_equal(matched, before) and np.allclose(position, old.position, rtol=0.0, atol=_SETTLED)
         if same and np.allclose(state.noise, old.noise, rtol=0.0, atol=_SETTLED):
-            # The state stays, with all that is known of it. A new one would compute the history of its landmarks again.
+            # The state stays, with its cached properties. A new state would compute the history of its landmarks again.
             stays = plausible(state)
             return state if stays.all() else state.keep(stays)
         state = replace(state, landmarks=replace(old, position=position), matched=matched)
@@ -311,7 +313,7 @@ def alternate(
 
 
 def explained(state: State, gate: float) -> Floats:
-    """Return for each label (L,) by how much its landmarks lower the cost of its rays."""
+    """Return the amount (L,) by which the landmarks of each label lower the cost of its rays."""
     edges = gated_edges(state.obs, state.landmarks, gate)
     own = state.matched[edges.ray] == edges.landmark
     gain = gate - edges.cost + _appearance_gain(state, edges)

@@ -31,7 +31,7 @@ from objslam.core.statistics import grouped_quantile, grouped_sums
 from objslam.core.types import Association
 
 _TURNS = 8
-"""The most searches of one kind among the unassigned rays. They end when one finds none. A larger number may find more."""
+"""The most searches of one kind among unassigned rays. They end when a search finds none. A larger number may find more."""
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
 _SAMPLE = 4096
 """The most rays of one label that a search uses, in whole frames. Later searches use other frames. More rays are slower."""
@@ -39,16 +39,16 @@ _FRAMES = 12
 """The fewest frames that a search uses, because an object is where rays of several frames meet. More frames are slower."""
 _MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have many rays. A larger value costs time.
 _MIN_SUPPORT = 2.5
-"""The least support of a point in a search. A ray that fits perfectly counts 1. A larger one finds fewer, surer points."""
+"""The least support of a point in a search. A ray that fits perfectly counts 1. A larger value finds fewer points."""
 _ABOVE_CHANCE = 3.0
-"""The least excess of a point's support over that by stray rays, in standard deviations. A larger one finds surer points."""
+"""The least excess of a point's support over that of stray rays, in standard deviations. A larger one finds surer points."""
 _CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search. A larger one drops weak objects.
 _CLEAR_MOTION = 3.0
-"""If the log odds of a moving point over a point at rest are above this, several points at rest are tried for its rays.
-Smaller odds try them more often, which takes time."""
+"""The log odds of a moving point over a point at rest above which several points at rest are tried for the rays. With a
+smaller value, they are tried more often, which takes time."""
 _EXPLAINED = 0.9
-"""Points at rest replace moving points if they explain at least this share of their rays. With a smaller share, parts of the
-path of a moving thing become objects. With a larger share, wrong boxes keep things at rest from being found."""
+"""The least share of the rays of moving points that points at rest must explain to replace them. With a smaller share, parts
+of the path of a moving thing become objects. With a larger share, wrong boxes keep things at rest from being found."""
 _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
 
 
@@ -85,7 +85,7 @@ def associate_globally(
         guess: an initial association of the rays, and the positions (N, 3) m of its objects. NaN drops an object.
         drifts: whether the poses drift as the odometry does, so that objects at rest seem to move.
         solved: whether the poses are from a joint solve. The rays of one thing meet there, as at localised poses.
-        repaired: whether the guess has no landmarks at crossings of rays. They are not searched, which halves the time.
+        repaired: whether the guess has no landmarks at crossings of rays. Skipping the search for them halves the time.
     """
     rays, keyframes, cameras = of.rays, of.keyframes, of.cameras
     obs, ray, keyframe = observe(of)
@@ -131,7 +131,7 @@ def _search(task: _Task, state: State, excluded: Landmarks) -> tuple[State, Bool
     If there are ranges at localised poses, a ray with a wrong range first supports no point at all. A robot that passes a
     row of equal things sees one after the other in the same direction. These rays meet far away, at a point that has more
     rays than each thing, and no range confirms it. Where ranges are missing, `ranged_by_size` may show them. Later, and at
-    poses that drift, wrong ranges only lower the support: there a right range may seem wrong on a later visit.
+    poses that drift, wrong ranges only lower the support. With drift, a right range may seem wrong on a later visit.
 
     Also returns the rays (R,) that belonged to a dropped landmark, and the landmarks that seemed to move, with their rays.
     """
@@ -200,7 +200,7 @@ def _discover(
         pool, judged = obs.take(free).noisier(noise[label]), None
         # About `chance` stray rays pass any point within the gate, and each supports it by 0.5 on average.
         chance = np.pi * task.gate * float((pool.sigma**2).sum()) / (state.view.solid_angle * obs.scale)
-        if wrong_range == 1.0:  # Most strays do not count then, because their ranges are wrong for the point.
+        if wrong_range == 1.0:  # Then most strays do not count, because their ranges are wrong for the point.
             judged = task.ranged.take(free).noisier(noise[label])
             chance *= float(right_by_chance(judged).mean())
         support = max(_MIN_SUPPORT, 0.5 * (chance + _ABOVE_CHANCE * np.sqrt(chance)))
@@ -230,11 +230,11 @@ def _alternate(task: _Task, state: State, times: int = 3) -> State:
 
 
 def _by_size(task: _Task, state: State, likely: Floats, sized: Bools) -> tuple[State, Floats]:
-    """Assign the rays once more, by bearing and size. likely: (N,) probability that each landmark exists. It is also
-    returned, for the landmarks that keep enough rays.
+    """Assign the rays once more, by bearing and size. likely: (N,) probability that each landmark exists. The landmarks with
+    enough rays and their probabilities are returned.
 
-    Sizes count only here, at the end. Before, an often hidden landmark needs every ray, or it would be dropped. sized: (R,)
-    whether the camera of each ray sees sizes.
+    Sizes count only here, at the end. Before the end, an often hidden landmark needs all its rays, or it would be dropped.
+    sized: (R,) whether the camera of each ray sees sizes.
     """
     obs = state.obs
     every = alternate(
@@ -252,7 +252,7 @@ def _plausible(task: _Task, state: State) -> Bools:
 
 
 def _kept(task: _Task, state: State, likely: Floats) -> tuple[State, Floats]:
-    """Return the plausible landmarks, and their probability to exist. likely: (N,) of all landmarks."""
+    """Return the plausible landmarks, and their probabilities to exist. likely: (N,) the probabilities of all landmarks."""
     stays = _plausible(task, state)
     return state.keep(stays), likely[stays]
 

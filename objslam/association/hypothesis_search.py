@@ -9,15 +9,16 @@ from objslam.core.array_module import Backend, Tensor, array_backend, as_numpy, 
 from objslam.core.arrays import Bools, Floats, Ints
 
 _PAIRS_AT_ONCE = {"numpy": 1 << 16, "cpu": 1 << 16, "cuda": 1 << 24}
-"""The most pairs of a ray and a point scored together, for each backend. On a CPU they fit into the cache. On CUDA, fewer
-need more calls: on an H100, 400,000,000 pairs took 141 ms with 2^18, and 12 ms with 2^22 to 2^28."""
+"""The most pairs of a ray and a point scored together, for each backend. On a CPU, this number of pairs fits into the cache.
+On CUDA, a smaller number needs more calls: on an H100, 400,000,000 pairs took 141 ms with 2^18, and 12 ms with 2^22 to
+2^28."""
 _LARGE = 1 << 26
-"""With at least this number of pairs of a ray and a point, CUDA scores them, if there is a card. With fewer, the start of
-CUDA costs more than it saves. An H100 scores 2^26 pairs in 2 ms, and numpy in 0.2 s."""
+"""The least number of pairs of a ray and a point that CUDA scores, if there is a card. With fewer pairs, the start of CUDA
+costs more than it saves. An H100 scores 2^26 pairs in 2 ms, and numpy in 0.2 s."""
 _DRAWS_EACH = 8  # The number of ray pairs drawn for each hypothesis. Most pairs of rays do not meet.
 _REFINEMENTS = 2  # The number of least-squares refinements of each hypothesis. A larger value costs time.
 _MIN_LEFT = 0.6
-"""The share of its support that a point must keep without the rays of better points. With less, it is left to a later
+"""The share of its support that a point must keep without the rays of better points. A point with less is left to a later
 search. A larger share leaves more points."""
 _SAME = 0.6
 """A point is the same as an excluded one if the rays that support both give it at least this share of its support. With a
@@ -27,27 +28,28 @@ WRONG_RANGE = 0.6
 """The share of a ray's support that a wrong range takes away, unless `Search.wrong_range` says otherwise. A larger value
 trusts ranges more."""
 _SIZE_PAIRS = 4000
-"""The number of pairs of rays drawn to find the usual size of a label. With a larger number, it is more exact and takes more
-time."""
+"""The number of pairs of rays drawn to find the usual size of a label. With a larger number, the size is more exact and
+takes more time."""
 _SAME_SIZE = 0.25
-"""Two boxes show the same size if ln size differs by less than this. With a larger value, the usual size is less exact."""
+"""The largest difference of ln size between two boxes that show the same size. With a larger value, the usual size is less
+exact."""
 _USUAL = 0.2
 """The least share of the pairs of meeting rays that show the usual size of a label. In simulated rows of equal things the
 share was 0.24 to 0.31. With a larger share, fewer labels have a usual size."""
 _CLEARLY_USUAL = 0.1
-"""The least share of the pairs that show the usual size, if it is clear (`_RIVAL`). The longer a row, the fewer pairs are
-rays to one thing: 0.13 to 0.18 along simulated streets with cars and lamp posts. With a larger share, fewer labels have a
-usual size."""
+"""The least share of the pairs that show the usual size, if this size is clear (`_RIVAL`). In a longer row, fewer pairs are
+rays to one thing. The share was 0.13 to 0.18 along simulated streets with cars and lamp posts. With a larger share, fewer
+labels have a usual size."""
 _RIVAL = 3.0
-"""The usual size is clear if it has this multiple of the pairs that show any other size. Along the simulated streets it had
-5 to 9 times as many. A wrong size, of cars that hid each other, had 2.3 times as many. With a larger multiple, fewer labels
-have a usual size."""
+"""The usual size is clear if the pairs that show it are at least this multiple of the pairs that show any other size. Along
+the simulated streets, the multiple was 5 to 9. For a wrong size, of cars that hid each other, it was 2.3. With a larger
+multiple, fewer labels have a usual size."""
 _LARGER = 1 + RANGE_LIMIT * SIZE_SPREAD
-"""A pair of rays that shows more than this times the usual size meets too far away. With a larger value, farther points
-count as the thing."""
+"""The multiple of the usual size above which a pair of rays meets too far away. With a larger value, farther points count as
+the thing."""
 _BEYOND = 0.2
-"""The least share of the pairs of meeting rays that meet too far away, from which sizes count. This share was 0.28 to 0.34
-in simulated rows of equal things, and at most 0.12 in rooms. With a larger share, sizes count in fewer logs."""
+"""Sizes count if at least this share of the pairs of meeting rays meets too far away. The share was 0.28 to 0.34 in
+simulated rows of equal things, and at most 0.12 in rooms. With a larger share, sizes count in fewer logs."""
 _LADDER = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)  # The distances (m) tried along rays without parallax.
 
 
@@ -55,8 +57,8 @@ _LADDER = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)  # The distances (m) tried a
 class Search:
     """The settings of a search. hypotheses: the most tried points where two rays meet. The ends of ranges and points along
     single rays come in addition. support: least support of a point. gate: largest squared deviation of a ray that supports a
-    point. parallax: least angle (rad) between the rays of a pair. With 0, distances along single rays are tried too. device:
-    the setting `triangulation.device`. wrong_range: the share of a ray's support that a wrong range takes away."""
+    point. parallax: least angle (rad) between the rays of a pair. With 0, distances along single rays are also tried.
+    device: the setting `triangulation.device`. wrong_range: the share of a ray's support that a wrong range takes away."""
 
     hypotheses: int
     support: float
@@ -67,7 +69,7 @@ class Search:
 
 
 def ranged_by_size(obs: Observations, sized: Bools, gate: float, parallax: float, seed: int) -> Observations:
-    """Return the rays with ranges that the sizes of boxes show, where no range is known and many rays meet too far away.
+    """Return the rays, with ranges from the sizes of boxes where no range is known and many rays meet too far away.
 
     The size of a box times the distance of the thing is similar for all things of a label. Where rays to several things meet
     far away, the boxes show a larger thing. sized: (R,) whether the box of each ray shows a size. gate, parallax: as in
@@ -86,7 +88,7 @@ def ranged_by_size(obs: Observations, sized: Bools, gate: float, parallax: float
 
 
 def _usual_size(obs: Observations, gate: float, parallax: float, rng: np.random.Generator) -> tuple[int, float] | None:
-    """Return the usual size (m) of the things of one label, after its side: 0 for the width and 1 for the height.
+    """Return a side of the things of one label, 0 for the width and 1 for the height, and the usual size (m) of this side.
 
     More pairs of meeting rays show this size than any other. The side counts on which more pairs agree, because one of
     the two may change with the view. The result is None if too few pairs show one size, or if few pairs meet so far away
@@ -156,8 +158,8 @@ def _best(scorer: "_Scorer", points: Floats, search: Search, excluded: Floats) -
 
 
 def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Floats:
-    """Return points (H, 3) where two rays of different frames meet, and where ranges end. If `search.parallax` is 0, return
-    points along single rays too."""
+    """Return the points (H, 3) m where two rays of different frames meet, and where ranges end. If `search.parallax` is 0,
+    points along single rays are added."""
     n = len(obs)
     # If there are fewer pairs than hypotheses, each pair is tried once. This is both faster and complete.
     few, draws = n * (n - 1) // 2 <= search.hypotheses, _DRAWS_EACH * search.hypotheses
@@ -188,7 +190,7 @@ def _meeting(
 
 
 def _draw(obs: Observations, count: int, rng: np.random.Generator) -> tuple[Ints, Ints]:
-    """Draw `count` pairs of rays, and return their indices. Some have only one ray, and drop out.
+    """Draw `count` pairs of rays, and return their indices. A pair with only one ray is left out, or has the same ray twice.
 
     If the first ray has a track, the second ray has the same track with probability 0.5. In all other cases, the logarithm
     of the number of rays between the two is uniform, because near frames more often show the same object.
@@ -242,7 +244,7 @@ class _Scorer:
         return as_tensor(np.ascontiguousarray(values, dtype=self.dtype), self.backend)
 
     def load(self, points: Floats) -> Tensor:
-        """Convert points (H, 3) in map to an array of the backend, relative to the mean camera position."""
+        """Convert points (H, 3) m in map to an array of the backend, relative to the mean camera position."""
         return self._tensor(points - self.centre)
 
     def supports(self, points: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ class Pairings:
     """P possible pairings of a measurement and a landmark, each with D residuals.
 
     row, column: (P,) the measurement and the landmark. residual: (P, D). covariance: (P, D, P, D) of all residuals, with the
-    correlations between pairings. rarity: (P,) minus the log density of the residuals of something new. gate: the largest
+    correlations between pairings. rarity: (P,) minus the log density of the residuals of a new thing. gate: the largest
     squared deviation of a pairing.
     """
 
@@ -38,8 +38,8 @@ class JointAssignment:
     """The best hypothesis.
 
     chosen: (n,) the indices of its pairings. odds: its log odds against the hypothesis that all measurements are of new
-    things. margin, rival: (n,) compare it, for each pairing, with the best hypothesis that lacks this pairing. margin: how
-    much larger its log odds are. rival: whether the other hypothesis pairs the same measurement with another landmark.
+    things. The best hypothesis without a pairing is its alternative. margin: (n,) by how much `odds` exceeds the log odds of
+    the alternative to each pairing. rival: (n,) whether this alternative pairs the same measurement with another landmark.
     """
 
     chosen: Ints
@@ -79,8 +79,8 @@ def _is_unambiguous(pairings: Pairings, allowed: Bools) -> bool:
 def _whole(pairings: Pairings, which: Ints) -> JointAssignment | None:
     """Return the hypothesis that has all pairings `which` (n,).
 
-    None if a pairing is outside the gate given all others, or if the hypothesis is better without it. This needs one inverse
-    of the joint covariance. The growth of a hypothesis needs one for each step.
+    Return None if a pairing is outside the gate given all others, or if the hypothesis is better without the pairing. This
+    test needs one inverse of the joint covariance. The growth of a hypothesis needs one inverse for each step.
     """
     residual, rarity = pairings.residual[which], pairings.rarity[which]
     size, dimension = residual.shape
@@ -99,7 +99,8 @@ def _whole(pairings: Pairings, which: Ints) -> JointAssignment | None:
 
 
 def _best(pairings: Pairings, odds: Floats, allowed: Bools) -> tuple[Ints, float]:
-    """Return the best hypothesis (n,) of allowed pairings and its log odds: empty and 0 if no pairing is likely."""
+    """Return the best hypothesis (n,) of allowed pairings and its log odds. Without a likely pairing, the hypothesis is
+    empty and its log odds are 0."""
     best, most = np.zeros(0, dtype=np.int64), 0.0
     seeds = np.flatnonzero(allowed)
     seeds = seeds[np.argsort(-odds[seeds], kind="stable")][:_SEEDS]

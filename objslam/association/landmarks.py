@@ -19,8 +19,8 @@ from objslam.core.statistics import NOISE_FACTORS, POOLED_WITH_CLASS, RAYLEIGH_M
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Objects as points. position: (N, 3) m. covariance: (N, 3, 3) m^2. noise: (N,) factor on the nominal noise of their
-    rays. accepts: (N, L) whether a box of a label may belong to them."""
+    """Objects as points. position: (N, 3) m. covariance: (N, 3, 3) m^2. noise: (N,) factor on the nominal noise of the rays
+    of each landmark. accepts: (N, L) whether a box of each label may belong to it."""
 
     position: Floats
     covariance: Floats
@@ -51,10 +51,10 @@ class Landmarks:
 @dataclass(frozen=True)
 class PredictedLandmarks:
     """The n landmarks and candidates that the next frame of a live session may show. The landmarks come first. landmarks:
-    their number. id: (n,) negative for candidates. label: (n,) negative for a candidate whose rays were grouped by label
-    alone. position: (n, 3) m. covariance: (n, 3, 3) m^2. drift: (n, 6, 6) covariance of the odometry's drift up to the last
-    observation. noise: (n,) factor on the noise of the rays. sizes: of their boxes. far: m, the greatest distance at which a
-    landmark was seen."""
+    the number of landmarks. id: (n,) negative for candidates. label: (n,) negative for a candidate whose rays were grouped
+    by label alone. position: (n, 3) m. covariance: (n, 3, 3) m^2. drift: (n, 6, 6) covariance of the odometry's drift from
+    the start to the last observation. noise: (n,) factor on the noise of the rays. sizes: the usual sizes of their boxes.
+    far: m, the greatest distance at which a landmark was seen."""
 
     landmarks: int
     id: Ints
@@ -72,7 +72,7 @@ class State:
     """Landmarks and their observations. matched: (R,) the landmark of each observation, or -1. view: the observed frames.
     ratio: what the appearance of boxes says, None without appearance vectors.
 
-    Properties are computed on first use and cached. R is the number of rays, P the number of rays with a landmark.
+    Properties are computed on first use and cached. R is the number of rays. P is the number of rays with a landmark.
     """
 
     obs: Observations
@@ -153,7 +153,8 @@ class State:
 
     @cached_property
     def size(self) -> Floats:
-        """Size (N,) m, the geometric mean of width and height, as the median over a landmark's boxes. 0 without boxes."""
+        """Size (N,) m of each landmark: the median, over its boxes, of the geometric mean of width and height. 0 without
+        boxes."""
         size = np.sqrt(self.obs.size[self.assigned].prod(axis=1)) * self.distance
         return np.nan_to_num(grouped_median(size, self.owner, self.count))
 
@@ -194,8 +195,8 @@ class State:
         return replace(self, landmarks=landmarks, matched=matched).keep(target == np.arange(len(target)))
 
     def split(self, which: Ints, second: Bools, position: Floats) -> State:
-        """Split the landmarks `which` (S,) in two. The second of each comes after all others, and gets its rays that are in
-        the mask `second` (R,). position: (S, 2, 3) m, of the two landmarks."""
+        """Split each landmark in `which` (S,) in two. The second part comes after all landmarks. It gets the rays of the
+        landmark that are in the mask `second` (R,). position: (S, 2, 3) m, the positions of the two parts."""
         number = np.full(self.count + 1, -1)
         number[which] = self.count + np.arange(len(which))
         moved = self.landmarks.position.copy()

@@ -17,34 +17,34 @@ from objslam.core.geometry import nearest_points
 from objslam.core.statistics import RAYLEIGH_MEDIAN, grouped_median
 
 _OBJECT_COST = 10.0
-"""The cost of one more object in squared deviations. BIC's cost is added: for each coordinate, ln of the number of rays."""
+"""The cost of one more object in squared deviations. BIC's cost, ln of the number of rays for each coordinate, is added."""
 _SHARED_SPACE = (0.35, 0.5)
-"""Two landmarks fill one space if their distance is below the first share of the smaller size, or below the second share of
-the larger size. Larger shares merge more landmarks."""
+"""The largest distances of two landmarks that fill one space. The first is a share of the smaller size, and the second is a
+share of the larger size. One of the two is enough. Larger shares merge more landmarks."""
 _MOST_APART = 0.1
-"""The largest share of frames in which one object may look like two. It is a share of the rarer landmark's rays, or of the
-frames that should show both landmarks. A larger share merges more landmarks."""
+"""The largest share of frames in which one object may look like two. It is a share of the rarer landmark's rays, of the
+frames that should show both landmarks, or of the frames with boxes of both. A larger share merges more landmarks."""
 _OFTEN = 5
-"""One of two landmarks has second boxes of the other if at least this number of frames has boxes of both, nearly all of
-these pairs lie on each other, and the landmarks are nearer than the smaller size. Things do not go through each other. A
-larger number leaves second boxes in short logs."""
+"""The least number of frames with boxes of two landmarks that shows that one of them has second boxes of the other. Nearly
+all such pairs of boxes must lie on each other, and the landmarks must be nearer than the smaller size. Things do not go
+through each other. A larger number leaves second boxes in short logs."""
 _MIN_EXPECTED = 5.0
-"""The number of frames that should show both landmarks is assumed to be at least this. A larger number merges more
-landmarks."""
+"""The least number of frames that are assumed to show both landmarks if detections are independent. A larger number merges
+more landmarks."""
 _DUPLICATE_OVERLAP = 0.5
-"""The least intersection over union of two boxes in one frame whose second box says nothing about a second object. With a
-smaller overlap, rays of two neighbours that overlap in many frames become one object."""
+"""The least intersection over union of two boxes in one frame with which the second box says nothing about a second object.
+With a smaller overlap, rays of two neighbours that overlap in many frames become one object."""
 _NEIGHBOURS = 8  # The number of nearest landmarks that each one is compared with. A larger value costs time in dense scenes.
 _REACH_GATES = 2.0
-"""The distance up to which two landmarks are compared, in gates of the noise of their rays. It is large because one object
-with little parallax may get landmarks at two distances. A larger value takes longer."""
+"""The distance up to which two landmarks are compared, in gates of the noise of their rays. This distance is large because
+one object with little parallax may get landmarks at two distances. A larger value takes longer."""
 
 
 @dataclass(frozen=True)
 class _Pairs:
     """P pairs of landmarks a < b, and the rays of all pairs in one flat list of Q rays. a, b: (P,) the landmarks. ray, pair:
-    (Q,) the index of each ray, and of its pair. For each pair, the rays of a come before the rays of b. A ray is listed once
-    for each pair of its landmark."""
+    (Q,) the index of each ray, and of its pair. For each pair, the rays of a come before the rays of b. A ray is in the list
+    once for each pair of its landmark."""
 
     a: Ints
     b: Ints
@@ -103,7 +103,7 @@ def close_pairs(state: State, gate: float) -> tuple[Ints, Ints]:
 
 def better_neighbours(state: State, failing: Bools, gate: float) -> Bools:
     """Return which landmarks (N,) have more rays than a neighbour of the same label, if both of them fail. Such a landmark
-    may get the rays of its neighbour, and then it need not fail.
+    may get the rays of its neighbour. With these rays, it may pass.
 
     failing: (N,) the landmarks that fail a test.
     """
@@ -185,8 +185,8 @@ def common_frames(history: DetectionHistory, a: Ints, b: Ints) -> list[Ints]:
 
 
 def _seen_together(obs: Observations, pairs: _Pairs, matched: Ints) -> tuple[Ints, Ints]:
-    """Return the number of frames (P,) in which both landmarks have a box, and in which these two boxes do not lie on each
-    other."""
+    """Return the number of frames (P,) in which both landmarks have a box, and the number of frames (P,) in which these two
+    boxes do not lie on each other."""
     order = np.lexsort((matched[pairs.ray], obs.frame[pairs.ray], pairs.pair))
     ray, pair = pairs.ray[order], pairs.pair[order]
     both = np.flatnonzero((np.diff(pair) == 0) & (np.diff(obs.frame[ray]) == 0))

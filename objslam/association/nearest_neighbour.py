@@ -28,10 +28,10 @@ def assign(
     A measured range changes the cost of a match. A wrong range adds at most `RANGE_LOSS`.
 
     Args:
-        positions: (N, 3) m, NaN to leave a landmark out. covariances: (N, 3, 3) m^2.
+        positions: (N, 3) m, NaN to leave a landmark out. covariances: (N, 3, 3) m^2, of the positions.
         accepts: (N, L) whether a box of a label may belong to the landmark.
-        map_T_camera: (K, 4, 4) of the rays' keyframes. sigma: (R,) rad, noise of the rays.
-        pose_covariance: (K, 6, 6) of the cameras, in camera coordinates, rotation first, as in GTSAM's marginals.
+        map_T_camera: (K, 4, 4) the camera poses of the rays' keyframes. sigma: (R,) rad, noise of the rays.
+        pose_covariance: (K, 6, 6) of the camera poses, in camera coordinates, rotation first (GTSAM's marginals).
         gate: the share of correct matches that the bearing gate accepts.
         looks: what the landmarks look like, None if this is not known.
     """
@@ -59,8 +59,8 @@ def associate_by_label(rays: Rays, off: Floats | None = None) -> Association:
     """Make one object for each label with a ray, in the order of label_names.
 
     In each frame, one box of each label gets the object: the nearest one if `off` is given, else the box with the highest
-    score. Of equal scores, the first box wins. All other boxes get no object. off: (R,) the angle between each ray and the
-    object of its label, NaN if it is not known.
+    score. If scores are equal, the first box wins. All other boxes get no object. off: (R,) the angle between each ray and
+    the object of its label, NaN if it is not known.
     """
     labels = np.unique(rays.label)
     far = np.zeros(len(rays)) if off is None else np.where(np.isfinite(off), off, np.inf)

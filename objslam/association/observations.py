@@ -1,6 +1,6 @@
-"""Rays as lines in the map for association, their closest approaches, and the sizes of what they observe.
+"""Represent rays as lines in the map, with their closest approaches and the sizes of the things that they observe.
 
-The sizes of boxes are evidence too: what a landmark usually measures, and what an unusual box costs.
+The sizes of boxes are also evidence. A landmark has usual sizes, and a box of an unusual size costs more.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -28,14 +28,15 @@ the measured spread less."""
 SIZED_BY = 5
 """The least number of boxes that give a landmark a size. A larger number leaves more landmarks without a size."""
 _SIZE_FREE = 5.99
-"""A size may deviate up to this squared deviation without a cost: chi-squared of 2 degrees of freedom at 95 %. With a larger
+"""The largest squared deviation of a size without a cost. It is chi-squared of 2 degrees of freedom at 95 %. With a larger
 value, only larger differences of size count."""
 SIZE_LOSS = 6.0
-"""The largest cost of a size, unless the box is of a nearer thing. It is less than a usual gate, so that the bearing alone
-can still match a half hidden thing. A larger value loses more boxes of half hidden things."""
+"""The largest cost of a size, unless the box is of a nearer thing. This cost is less than a usual gate, so that the bearing
+alone can still match a half hidden thing. A larger value loses more boxes of half hidden things."""
 _ONE_FACTOR = 3.84
-"""Two sides are larger by one factor up to this squared deviation from it: chi-squared of 1 degree of freedom at 95 %. With
-a larger value, boxes with other proportions than the landmark's count as boxes of nearer things too."""
+"""The largest squared deviation from one factor with which both sides count as larger by this factor. It is chi-squared of 1
+degree of freedom at 95 %. With a larger value, boxes with other proportions than the landmark's also count as boxes of
+nearer things."""
 RANGE_LIMIT = 3.0
 """The deviation, in standard deviations, from which a range counts as wrong. A larger value believes more ranges."""
 
@@ -45,9 +46,9 @@ class LinesByLabel:
     """Lines (R,) in the map, sorted by label. Two matrix products compare all lines of a label with points.
 
     order: (R,) the observations in this order. bounds: (L + 1,) where the lines of each label begin and end. centre: (3,) m,
-    the mean of the origins. For a point p in m from the centre, (p, 1) times the column of a line in `depth` (4, R) is the
-    depth of the point along it, and (p, p p, 1) times its column in `distance2` (5, R) the squared distance from its origin.
-    sigma2: (R,) rad^2, the noise.
+    the mean of the origins. A point p, in m from the centre, is multiplied with the column of a line. (p, 1) times the
+    column in `depth` (4, R) is the depth of p along the line. (p, p p, 1) times the column in `distance2` (5, R) is the
+    squared distance of p from the origin of the line. sigma2: (R,) rad^2, the squared noise.
     """
 
     order: Ints
@@ -61,12 +62,12 @@ class LinesByLabel:
 @dataclass(frozen=True)
 class Observations:
     """R boxes as lines in the map. They are sorted by frame, then by the values of the box, so the input order has no
-    effect. frame: (R,) index of the frame in time order. label: (R,). origin: (R, 3) m in map. direction: (R, 3) unit in
-    map. sigma: (R,) rad, noise along each perpendicular axis. position_sigma: m, noise of the origins. range: (R,) m, NaN if
-    unknown. range_sigma: (R,) m. size: (R, 2) width and height of the object per metre of its distance. box: (R, 4) px.
-    track: (R,) id of the track, -1 if unknown. feature: (R,) the row of the box's appearance vector in feature_table, -1
-    without one. feature and feature_table are None if no box has a vector. scale: lines, and so landmarks, are in a world
-    that is flattened along z by this factor (`core.ground.flattening`)."""
+    effect. frame: (R,) index of the frame in time order. label: (R,) index of the label. origin: (R, 3) m in map. direction:
+    (R, 3) unit in map. sigma: (R,) rad, noise along each perpendicular axis. position_sigma: m, noise of the origins. range:
+    (R,) m, NaN if unknown. range_sigma: (R,) m. size: (R, 2) width and height of the object per metre of its distance. box:
+    (R, 4) px. track: (R,) id of the track, -1 if unknown. feature: (R,) the row of the box's appearance vector in
+    feature_table, -1 without one. feature and feature_table are None if no box has a vector. scale: the factor by which the
+    world of the lines and landmarks is flattened along z (`core.ground.flattening`)."""
 
     frame: Ints
     label: Ints
@@ -104,7 +105,7 @@ class Observations:
 
     @cached_property
     def by_label(self) -> LinesByLabel:
-        """The lines, those of one label side by side."""
+        """The lines, sorted by label."""
         labels = int(self.label.max(initial=-1)) + 1
         order = order_by_group(self.label, labels)
         bounds = np.searchsorted(self.label[order], np.arange(labels + 1))
@@ -147,9 +148,9 @@ def closest_approach(obs: Observations, first: Ints, second: Ints) -> tuple[Floa
 class PosedRays:
     """The rays of K keyframes at given camera poses, with their noise.
 
-    rays, keyframes: all observed frames and their rays. Frames without a ray count as misses. map_T_camera: (K, 4, 4) of the
-    keyframes. sigma: (R,) rad, the noise of the directions. position_sigma: m, the noise of the origins along each axis.
-    scale: as in `Observations`.
+    keyframes, rays: all observed frames and their rays. Frames without a ray count as misses. map_T_camera: (K, 4, 4) the
+    camera poses of the keyframes. sigma: (R,) rad, the noise of the directions. position_sigma: m, the noise of the origins
+    along each axis. scale: as in `Observations`.
     """
 
     rays: Rays
@@ -222,8 +223,8 @@ def overlap(one: Floats, two: Floats) -> Floats:
 class UsualSizes:
     """What the boxes of N landmarks usually measure.
 
-    number: (N,) of the boxes with a size. ln_size: (N, 2) medians of ln width and ln height, in m. variance: (N, 2) of ln
-    width and ln height over the boxes of the landmark. Without boxes, the medians are NaN.
+    number: (N,) the number of boxes with a size. ln_size: (N, 2) medians of ln width and ln height (m). variance: (N, 2) the
+    variances of ln width and ln height over the boxes of the landmark. Without boxes, the medians are NaN.
     """
 
     number: Ints
@@ -232,7 +233,7 @@ class UsualSizes:
 
     @classmethod
     def of(cls, size: Floats, distance: Floats, owner: Ints, count: int) -> Self:
-        """Take the usual sizes from P boxes.
+        """Compute the usual sizes from P boxes.
 
         size: (P, 2) width and height of the object per metre of its distance. A box with a size of 0 has no size. distance:
         (P,) m. owner: (P,) the landmark of each box. count: number N of landmarks.
@@ -256,11 +257,12 @@ class UsualSizes:
         """Return the cost (E,) >= 0 of the size of the box in each match, in squared standard deviations.
 
         Bearings do not distinguish a small thing from a large thing on the same line of sight. If only one of the two is
-        detected, its box fits the bearings of both, but only one of the sizes. Boxes of another size than usual cost more.
-        The cost is at most `SIZE_LOSS`, because a thing can be half hidden, and a box can have two things side by side. It
-        has no limit if both sides are larger than usual by one factor and the range is too short: size and range show a
-        nearer thing. A box without a size, and a landmark with few boxes, cost nothing. ray, landmark: (E,) of the matches.
-        distance: (E,) m, from the camera to the landmark. distance_sigma: (E,) m, its uncertainty, by default 0.
+        detected, its box fits the bearings of both, but the size of only one. Boxes of another size than usual cost more.
+        The cost is at most `SIZE_LOSS`, because a thing can be half hidden, and a box can have two things side by side. The
+        cost has no limit if both sides are larger than usual by one factor and the range is too short. Then size and range
+        show a nearer thing. A box without a size, and a landmark with few boxes, cost nothing. ray, landmark: (E,) of the
+        matches. distance: (E,) m, from the camera to the landmark. distance_sigma: (E,) m, the standard deviation of the
+        distance, by default 0.
         """
         cost = np.zeros(len(ray))
         some = np.flatnonzero((self.number[landmark] >= SIZED_BY) & (obs.size[ray] > 0).all(axis=1))

@@ -1,8 +1,8 @@
-"""How likely objects of a map are still there, session after session: the persistence filter.
+"""Estimate how likely the objects of a map are still there, session after session, with the persistence filter.
 
-Rosen, Mason, Leonard 2016, Towards lifelong feature-based mapping in semi-static environments. The time for which an object
-stays is exponentially distributed. So the filter needs only the last probability and the time since then. A session is one
-measurement: it finds the object or misses it. A miss counts only as far as the object was in view.
+The filter is from Rosen, Mason and Leonard 2016, Towards lifelong feature-based mapping in semi-static environments. The
+time for which an object stays is exponentially distributed. So the filter needs only the last probability and the time since
+then. A session is one measurement: it finds the object or misses it. A miss counts only as far as the object was in view.
 """
 
 import numpy as np
@@ -19,12 +19,12 @@ person in the way. A larger value needs more misses before an object is gone."""
 _BY_CHANCE = 0.02
 """The probability that a session finds something at a place where there is no object. A larger value trusts a find less."""
 _CONCENTRATION = 5.0
-"""How alike the detection rates of an object are in different sessions: the sum of the parameters of their beta
-distribution. With a larger value, many misses count more. Offline association finds values around this one."""
+"""The sum of the parameters of the beta distribution of an object's detection rates in different sessions. With a larger
+value, the rates are more alike, and many misses count more. Offline association finds values around this one."""
 _RATE = 0.5
 """The assumed share of looks that detect a new object. A larger value makes a miss count more."""
 _LOOKS = 4.0
-"""`_RATE` counts as much as this number of looks at the object. A larger value needs more looks to change the rate."""
+"""The weight of `_RATE`, as a number of looks at the object. A larger value needs more looks to change the rate."""
 _LEAST, _MOST = 1e-9, 1 - 1e-9
 """The limits of a probability. They let an object come back after any number of misses."""
 
@@ -34,7 +34,7 @@ def persistence(before: Floats, days: Floats, found: Bools, looks: Ints, past_lo
 
     Args:
         before: (N,) the probability after the session before.
-        days: (N,) the time since that session.
+        days: (N,) the number of days since that session.
         found: (N,) whether the session found the object.
         looks: (N,) in how many frames of the session it should have been detected if it was there.
         past_looks, past_detections: (N,) the looks and detections of all sessions before. They give the detection rate.

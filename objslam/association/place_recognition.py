@@ -23,7 +23,7 @@ _BENT, _BENT_PER_M = 0.07, 0.02
 """The deformation of a neighbourhood: a constant (m), and a part per metre from the pivot. Larger values accept pairs that
 fit less well."""
 _MARGIN = 2.0
-"""The density of landmarks refers to the rectangle around all landmarks, with this margin (m) on each side. With a larger
+"""The margin (m) on each side of the rectangle around all landmarks in which their density is computed. With a larger
 margin, landmarks count as sparser, so a match is more evidence."""
 _REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis and of its assignment. Few are enough from a close start.
 _CANDIDATES = 3000
@@ -87,7 +87,7 @@ class Recognition:
         return enough and len(self.pairs) >= MIN_LANDMARKS
 
     def against(self, other: Self | None) -> Self:
-        """Return this recognition with its lead over another explanation too. None counts as the evidence 0."""
+        """Return this recognition, with its lead limited to its lead over `other`. None counts as the evidence 0."""
         return self if other is None else replace(self, lead=min(self.lead, self.evidence - max(other.evidence, 0.0)))
 
 
@@ -100,7 +100,8 @@ def recognise_place(
     possible: Bools,
     alike: Floats | float = 0.0,
 ) -> Recognition | None:
-    """Find the correction within the drift that moves landmarks `here` (N) onto landmarks `there` (M). None if none fits.
+    """Find the correction within the drift that moves landmarks `here` (N) onto landmarks `there` (M). Return None if none
+    fits.
 
     pivot: (2,) m, the point about which the correction turns. prior: (3, 3) covariance of the correction in x, y (m) and yaw
     (rad), with mean zero. density: (N,) number of landmarks `there` per m^2 that have the label of each landmark `here`.
@@ -150,7 +151,8 @@ def repetition(
 ) -> Recognition | None:
     """Return the best match of some landmarks with others that a frame shows beside them. None if nothing matches.
 
-    Both cannot be the same, so the match shows how far the place repeats itself, as the doors of a corridor do.
+    Two landmarks in one frame cannot be the same. So the match shows how far the place repeats itself, as the doors of a
+    corridor do.
 
     Args:
         position, covariance, label: (N, 3) m, (N, 3, 3) m^2, (N,) of all landmarks.
@@ -173,9 +175,9 @@ class _Problem:
     """The matching problem of `recognise_place`, with N landmarks `here` and M landmarks `there`.
 
     offset: (N, 3) m, target: (M, 3) m: the landmarks `here` and `there` relative to the pivot. information: (N, M, 3, 3)
-    m^-2, the inverse covariance of the offset between two of them. spread: (N, M) m, its horizontal standard deviation.
-    peak: (N, M) the gain of a pair at distance 0. possible: (N, M) whether both may be one landmark. prior: (3, 3)
-    covariance of the correction in x, y (m) and yaw (rad). weight: (3, 3) its inverse.
+    m^-2, the inverse covariance of the offset between two of them. spread: (N, M) m, the horizontal standard deviation of
+    this offset. peak: (N, M) the gain of a pair at distance 0. possible: (N, M) whether both may be one landmark. prior: (3,
+    3) covariance of the correction in x, y (m) and yaw (rad). weight: (3, 3) the inverse of `prior`.
     """
 
     offset: Floats
@@ -262,8 +264,8 @@ def _solve_seeds(problem: _Problem, seeds: Ints) -> Floats:
 def _gauss_newton(problem: _Problem, a: Ints, b: Ints, begin: Ints, information: Floats, x: Floats) -> tuple[Floats, Floats]:
     """Return the corrections (H, 3) after one Gauss-Newton step, and the Hessians (H, 3, 3).
 
-    a, b: (P,) the pairs of all corrections, one correction after the other. begin: (H,) the first pair of each correction,
-    which has at least one. information: (P, 3, 3) m^-2, of the pairs.
+    a, b: (P,) the pairs of all corrections, one correction after the other. begin: (H,) the first pair of each correction.
+    Each correction has a pair. information: (P, 3, 3) m^-2, of the pairs.
     """
     owner = np.repeat(np.arange(len(x)), np.diff(begin, append=len(a)))
     at, jacobian = (part[:, 0] for part in _moved(problem.offset[a][:, None], x[owner]))
@@ -277,7 +279,8 @@ def _gauss_newton(problem: _Problem, a: Ints, b: Ints, begin: Ints, information:
 def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
     """Return the gain (H,) of corrections (H, 3) if each landmark takes its best partner. a, b: (C,) pairs, sorted by a.
 
-    Under one correction, few of the pairs are close. Only these get a gain, which takes less than half the time of all."""
+    Under one correction, few of the pairs are close. Only these get a gain. This takes less than half the time of gains for
+    all."""
     score = -0.5 * np.einsum("hi,ij,hj->h", x, problem.weight, x)
     moved = np.stack(_turned(problem.offset, x)) + x.T[:2, :, None]
     target, reach = problem.target[b, :2].T, 2 * SAME_POINT_WIDE * problem.spread[a, b] ** 2

@@ -8,20 +8,20 @@ from objslam.core.rotation import dots
 from objslam.core.statistics import HALF_RAY, grouped_quantiles, grouped_sums, order_by_group
 
 RANGE_GAIN = 6.0
-"""A perfect range lowers the cost of a match by this, because another object would rarely have this range. A larger value
-trusts ranges more."""
+"""The amount by which a perfect range lowers the cost of a match. Another object would rarely have this range. A larger
+value trusts ranges more."""
 RANGE_LOSS = 4.0
-"""A wrong range raises the cost of a match by at most this. About one correct box in ten has a wrong range. With a larger
-value, more correct boxes are lost."""
+"""The largest amount by which a wrong range raises the cost of a match. About one correct box in ten has a wrong range. With
+a larger value, more correct boxes are lost."""
 BEHIND = 1e6
-"""The deviation, in standard deviations, of a point behind the camera: large, but finite."""
+"""The deviation, in standard deviations, of a point behind the camera. It is large, but finite."""
 _HALF_RANGE = 3.0  # The scale of the robust range weight in squared deviations. With a larger one, wrong ranges pull more.
 _DAMPING = 1e-6
 """The share of the information added in all directions. Unobserved directions then stay unchanged. A larger share slows the
 refinement down."""
 _ITERATIONS = 6  # The Gauss-Newton steps of a refinement. Few are enough, because association refines repeatedly.
 _STILL = 1e-11
-"""A point rests if its step (m) is at most this long. Rounding errors in a map of kilometres are as large. With a larger
+"""The longest step (m) of a point that counts as at rest. Rounding errors in a map of kilometres are as large. With a larger
 value, positions are less exact, and an association is less surely the same from another start."""
 _PAIRS_AT_ONCE = 1 << 13
 """The most pairs of a ray and a point whose terms `refine` computes together, which fit into the processor's cache. A larger
@@ -31,8 +31,8 @@ _FIRST, _SECOND = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
 
 
 def variance(obs: Observations, distance: Floats, noise: Floats | float, of: Ints | slice = slice(None)) -> Floats:
-    """Return the variance (E,) m^2, along each perpendicular axis, of the offset of a point from its ray. distance: (E,) m
-    of the points. noise: factor on the nominal noise. of: (E,) the rays, by default all."""
+    """Return the variance (E,) m^2, along each perpendicular axis, of the offset of a point from its ray. distance: (E,) m,
+    from the camera to the points. noise: factor on the nominal noise. of: (E,) the rays, by default all."""
     return np.asarray(noise**2 * ((obs.sigma[of] * distance) ** 2 + obs.position_sigma**2))
 
 
@@ -67,9 +67,9 @@ def information(obs: Observations, point: Floats) -> Floats:
 def range_costs(
     obs: Observations, distance: Floats, variance_along: Floats | float = 0.0, of: Ints | slice = slice(None)
 ) -> Floats:
-    """Return the cost (E,) of each ray's measured range, if its point is at `distance` (E,) m. It lies between -`RANGE_GAIN`
-    and `RANGE_LOSS`, and is 0 for a ray without a range. variance_along: (E,) m^2 of the point along the ray. of: (E,) the
-    ray of each point, by default all rays."""
+    """Return the cost (E,) of each ray's measured range, if its point is at `distance` (E,) m. The cost lies between
+    -`RANGE_GAIN` and `RANGE_LOSS`. It is 0 for a ray without a range. variance_along: (E,) m^2, the variance of the point
+    along the ray. of: (E,) the ray of each point, by default all rays."""
     measured = obs.range[of]
     if not np.isfinite(measured).any():
         return np.zeros(len(distance))
@@ -192,7 +192,7 @@ def velocity_gain(
     """Fit a velocity to each point. Return the share (N,) of the squared deviations that the velocity explains, and the
     distance (N,) m that each point moves while its rays see it.
 
-    Pairs and points are as in `refine`. stamps: (P,) s of the rays.
+    Pairs and points are as in `refine`. stamps: (P,) s, the times of the rays.
     """
     count = len(position)
     origin, direction = obs.origin[ray], obs.direction[ray]

@@ -1,6 +1,6 @@
 """Triangulate one object of a live session by RANSAC, from pairs of rays.
 
-The room `triangulation` does this for all objects of a log. Its calls of torch take too long for one frame.
+The folder `triangulation` does this for all objects of a log. The calls of torch in it take too long for one frame.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ _FREE_INFORMATION = 1e-4  # The information (m^-2) added to each axis: a prior o
 @dataclass(frozen=True)
 class PointFit:
     """One fitted point. position: (3,) m. covariance: (3, 3) m^2. parallax: rad, the widest angle between the inliers.
-    inlier: (R,) bool."""
+    inlier: (R,) whether each ray is an inlier."""
 
     position: Floats
     covariance: Floats
@@ -32,7 +32,8 @@ class PointFit:
 
 
 def fit_point(obs: Observations, rng: np.random.Generator, slack: float = 0.0) -> PointFit | None:
-    """Fit the point on which most rays agree. None if no two rays agree. slack: m, the standard deviation of the origins."""
+    """Fit the point on which most rays agree. Return None if no two rays agree. slack: m, the standard deviation of the
+    origins."""
     start = _consensus(obs, rng, slack)
     if start is None:
         return None
@@ -56,8 +57,8 @@ def fit_point(obs: Observations, rng: np.random.Generator, slack: float = 0.0) -
 
 
 def _consensus(obs: Observations, rng: np.random.Generator, slack: float) -> Floats | None:
-    """Return the point (3,) with the least robust cost: the midpoint of two rays, or the end of a range. None if there is
-    neither."""
+    """Return the point (3,) with the least robust cost: the midpoint of two rays, or the end of a range. None if no such
+    point exists."""
     count = len(obs)
     some = np.arange(count) if count <= _MOST_RAYS else np.sort(rng.permutation(count)[:_MOST_RAYS])
     a, b = (some[i] for i in np.triu_indices(len(some), 1))

@@ -17,22 +17,22 @@ from objslam.core.statistics import distinct, grouped_median, grouped_quantile, 
 from objslam.core.types import Keyframes
 
 _WHOLE = 0.25
-"""The boxes of a camera go around whole objects if more than this share of its boxes at the image's edge reach beyond it.
-The share was 0.5 in three recordings of such boxes. With a larger value, the misses of such detectors count less often. With
-a smaller one, a few wrong boxes change what counts as a miss."""
+"""The share of a camera's boxes at the image's edge that must reach beyond it, if the boxes go around whole objects. The
+share was 0.5 in three recordings of such boxes. With a larger value, the misses of such detectors count less often. With a
+smaller one, a few wrong boxes change what counts as a miss."""
 _PAIRS_AT_ONCE = 1 << 18  # The most pairs of an object and a frame processed together, which fit into the processor's cache.
 _USUAL_DISTANCES = (0.02, 0.98)
 """The quantiles of a class's detection distances. Outside them, a miss means nothing. A wider range counts more misses."""
 _CORE_SHARE = 0.8
-"""The usual distances of a class come from this share of its boxes, on the objects with the most boxes. Objects with few
-boxes may be phantoms. A larger share lets phantoms widen the usual distances."""
+"""The share of a class's boxes from which its usual distances come. The objects with the most boxes are taken. Objects with
+few boxes may be phantoms. A larger share lets phantoms widen the usual distances."""
 _FRONT_SHARE = 0.95
-"""An object has a front if at least this share of its boxes is from one half space. A larger share gives fewer objects a
-front."""
+"""The least share of an object's boxes from one half space with which the object has a front. A larger share gives fewer
+objects a front."""
 _CLOSER = (0.3, 0.1)
 """The least distance from an occluder to the object behind it: in m, and as a share of the object's distance. The larger one
-counts. Half the sum of the two sizes replaces the first if it is smaller, because on a table a thing may hide its neighbour.
-Larger values hide fewer objects."""
+counts. Half the sum of the two sizes replaces the first value if that is larger, because on a table a thing may hide its
+neighbour. Larger values hide fewer objects."""
 _SAME_SIDE = np.cos(np.radians(45.0))
 """The cosine of the largest angle between two views of one side of an object. A smaller cosine counts more frames."""
 _FILLED = 0.6  # The share of a box's width and height that its object certainly fills. A larger value occludes more.
@@ -76,8 +76,8 @@ def frames_of(
 ) -> CameraFrames:
     """Convert keyframes to observed frames.
 
-    order: (K,) the keyframes, in the order of the frames. map_T_camera: (K, 4, 4) of the keyframes. drifts: whether these
-    poses drift as the odometry does. cut: as in `Rays`.
+    order: (K,) the keyframes, in the order of the frames. map_T_camera: (K, 4, 4) the camera poses of the keyframes. drifts:
+    whether these poses drift as the odometry does. cut: as in `Rays`.
     """
     poses, margins = map_T_camera[order], (settings.rays.border, settings.rays.border_share)
     drift = keyframes.drift[order] if drifts and keyframes.drift is not None else None
@@ -102,8 +102,9 @@ def _in_frames(cut: CutBoxes, camera: Ints, frame: Ints) -> CutBoxes:
 class DetectionHistory:
     """V pairs of an object and a frame in which it is or should be detected, sorted by object, then by frame.
 
-    object, frame, detected: (V,). inside: (N,) number of frames whose image contains each object's box, and whose camera is
-    near enough to detect it: within the usual distances of the class, or no farther than the object's farthest box.
+    object, frame, detected: (V,) of each pair. inside: (N,) number of frames whose image contains each object's box, and
+    whose camera is near enough to detect it: within the usual distances of the class, or no farther than the object's
+    farthest box.
     """
 
     object: Ints
@@ -130,7 +131,7 @@ def detection_history(
     An object should be detected under four conditions. Its box lies in the image, and no cut off box of its label is there.
     Its distance is in the usual range of its class, extended to the median distance of its own boxes. No closer box hides
     it. The camera sees its front, if it has one. matched: (R,) the object of each observation, -1 for none. position, label:
-    (N, 3) m and (N,), of the objects, in the world of the observations.
+    (N, 3) m and (N,) of the objects, in the world of the observations.
     """
     if obs.scale != LEVEL:
         position, obs = raised_points(position, obs.scale), replace(obs, origin=raised_points(obs.origin, obs.scale))
@@ -219,7 +220,8 @@ def _from_the_front(toward: Floats, index: Ints, position: Floats, obj: Ints, fr
     """Return whether the camera of each frame (V,) sees the front of its object (V,). A screen, for example, has a front.
 
     An object has a front if nearly all its boxes come from one half space. Misses from behind then mean nothing. toward: (3,
-    P) unit, from the object of each box to the camera. index: (P,) this object. map_T_camera: (F, 4, 4) of the frames.
+    P) unit, from the object of each box to the camera. index: (P,) the object of each box. map_T_camera: (F, 4, 4) of the
+    frames.
     """
     count, seen = len(position), np.ones(len(obj), dtype=bool)
     front = grouped_sums(toward.T, index, count).T
@@ -301,8 +303,8 @@ def _mean_size(extent: Floats) -> Floats:
 
 
 def _cut_off(frame: Ints, label: Ints, pixel: Floats, cut: CutBoxes) -> Bools:
-    """Return whether a cut off box of the same label contains each pixel (V, 2). frame, label: (V,), as the pixels. cut:
-    sorted by frame."""
+    """Return whether a cut off box of the same label contains each pixel (V, 2). frame, label: (V,) the frame and the label
+    of each pixel. cut: sorted by frame."""
     begin, end = (np.searchsorted(cut.frame, frame, side=side) for side in ("left", "right"))
     inside = np.zeros(len(frame), dtype=bool)
     for k in range(int((end - begin).max(initial=0))):  # Each step checks the k-th box of all frames that have one.

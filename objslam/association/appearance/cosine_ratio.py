@@ -1,9 +1,9 @@
 """The likelihood ratio of a cosine between appearance vectors: one object against two objects of one label.
 
-Both densities are Gaussians with a random effect, learnt from the boxes of a log. The mean of the cosines between m boxes
-and n boxes has the variance between + within (1/m + 1/n). `between` is the variance between objects (or pairs of objects),
-and `within` is the variance between single boxes. With few boxes, both densities are near each other, so the ratio is near
-1.
+The cosines of one object and the cosines of two objects each have a Gaussian density with a random effect. Both densities
+are learnt from the boxes of a log. The mean of the cosines between m boxes and n boxes has the variance between + within
+(1/m + 1/n). `between` is the variance between objects (or pairs of objects), and `within` is the variance between single
+boxes. With few boxes, the two densities are alike, so the ratio is near 1.
 """
 
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ _PRIOR = 20.0
 """The weight of the prior, as a number of pairs. In the prior, boxes of one object are as alike as boxes of two objects, and
 all labels are equal. A larger number needs a longer log to learn from."""
 _LEAST_APART = 0.3
-"""Appearance vectors are used if the mean cosine within objects is larger than the mean cosine between objects by this. The
-unit is the standard deviation of the cosine between a box and an object with many boxes. A larger value leaves more weak
-vectors unused. With random vectors, the difference is 0.1 in a log of a few hundred boxes."""
+"""The least excess of the mean cosine within objects over the mean cosine between objects with which appearance vectors are
+used. Its unit is the standard deviation of the cosine between a box and an object with many boxes. A larger value leaves
+more weak vectors unused. With random vectors, the difference is 0.1 in a log of a few hundred boxes."""
 _LEAST_SHARE = 1e-3
 """The least share of `between` in the variance, and the least standard deviation of the cosines. It only keeps the ratio
 finite."""
@@ -30,22 +30,23 @@ from behind, and some boxes show two objects."""
 
 @dataclass(frozen=True)
 class Density:
-    """The Gaussian density of the cosines of each label. mean: (L,) of the cosines. between, within: (L,) the two parts of
-    their variance, as in the formula of this module."""
+    """The Gaussian density of the cosines of each label. mean: (L,) the mean cosine. between, within: (L,) the two parts of
+    the variance of the cosines, as in the formula of this module."""
 
     mean: Floats
     between: Floats
     within: Floats
 
     def spread(self, label: Ints, one: Ints | float, other: Ints | float) -> Floats:
-        """Return the variance (E,) of the mean cosine between groups of `one` and of `other` boxes. label: (E,) of both
-        groups."""
+        """Return the variance (E,) of the mean cosine between groups of `one` and of `other` boxes. label: (E,) the label of
+        both groups."""
         return np.asarray(self.between[label] + self.within[label] * (1 / one + 1 / other))
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """P pairs of boxes of one label. cosine: (P,). label: (P,). group: (P,) a number for each object, or pair of objects."""
+    """P pairs of boxes of one label. cosine, label: (P,) of each pair. group: (P,) the number of its object, or of its pair
+    of objects."""
 
     cosine: Floats
     label: Ints
@@ -111,9 +112,9 @@ def _density(pairs: Pairs, prior: tuple[float, float], labels: int) -> Density:
 
 
 def _intraclass_correlation(off: Floats, group: Ints) -> float:
-    """Return the correlation between deviations of one group. off, group: (P,) the deviations and their groups.
+    """Return the correlation between the deviations within a group. off, group: (P,) the deviations and their groups.
 
-    With few pairs it is near 1. Then many boxes of an object count as much as one box.
+    With few pairs, the correlation is near 1. Then many boxes of an object count as much as one box.
     """
     _, number = np.unique(group, return_inverse=True)
     size, total, squares = (np.bincount(number, weights) for weights in (None, off, off**2))

@@ -34,7 +34,8 @@ class Looks:
 
     @classmethod
     def of(cls, boxes: Boxes, owner: Ints, count: int, ratio: CosineRatio) -> Self:
-        """Return the looks of landmarks. owner: (R,) the landmark of each box, -1 for none. count: the number N."""
+        """Return the looks of landmarks. owner: (R,) the landmark of each box, -1 for none. count: the number N of
+        landmarks."""
         from scipy.sparse import csr_array
 
         feature, vectors = _vectors(boxes)
@@ -45,8 +46,9 @@ class Looks:
     def ray_odds(self, boxes: Boxes, ray: Ints, landmark: Ints, own: Bools) -> Floats:
         """Return the log odds (E,) that boxes show landmarks, and not other objects of their labels.
 
-        ray: (E,) the index of each box. own: (E,) whether the box belongs to the landmark. Such a box is not compared with
-        itself. The odds are 0 if the box, or all other boxes of the landmark, have no vector.
+        ray, landmark: (E,) the indices of the boxes and of the landmarks. own: (E,) whether the box belongs to the landmark.
+        Such a box is not compared with itself. The odds are 0 if the box, or all other boxes of the landmark, have no
+        vector.
         """
         feature, vectors = _vectors(boxes)
         others = self.number[landmark] - own
@@ -57,8 +59,8 @@ class Looks:
         return odds
 
     def landmark_odds(self, a: Ints, b: Ints, label: Ints) -> Floats:
-        """Return the log odds (P,) that landmarks `a` and `b` (P,) are one object of a label (P,), and not two. They are 0
-        if one of the two has no vector."""
+        """Return the log odds (P,) that landmarks `a` and `b` (P,) are one object of a label (P,), and not two. The odds are
+        0 if one of the two landmarks has no vector."""
         odds, known = np.zeros(len(a)), np.flatnonzero((self.number[a] > 0) & (self.number[b] > 0))
         a, b = a[known], b[known]
         cosine = _products(self.total, a, self.total, b) / (self.number[a] * self.number[b])
@@ -67,11 +69,12 @@ class Looks:
 
 
 def learn_ratio(boxes: Boxes, frame: Ints, track: Ints, owner: Ints, labels: int) -> CosineRatio | None:
-    """Learn the ratio from boxes and their landmarks (R,), -1 for none. None if the boxes have no vectors that tell objects
+    """Return the ratio, learnt from boxes and their landmarks. Return None if the boxes have no vectors that tell objects
     apart.
 
     Consecutive boxes of one landmark, or of one track, show one object. Boxes of one label in one frame that hardly overlap
-    show two objects. frame, track: (R,) of the boxes, -1 without a track. labels: the number of all labels.
+    show two objects. frame, track, owner: (R,) the frame, the track and the landmark of each box, -1 for no track and for no
+    landmark. labels: the number of all labels.
     """
     if boxes.feature is None:
         return None

@@ -1,4 +1,4 @@
-"""The rays of landmarks, divided into two bundles, at the widest gap between their directions."""
+"""Divide the rays of each landmark into two bundles, at the widest gap between their directions."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.statistics import STRAY_RAY, grouped_median, grouped_sums
 
 COUNTED = 10
-"""The most boxes of a bundle that count as independent measurements of its growth, as in `existence`. A larger number trusts
-growing boxes more."""
+"""The most boxes of a bundle that count as independent measurements of how boxes grow as the robot comes nearer. `existence`
+has the same limit. A larger number trusts growing boxes more."""
 TIGHTNESS = 0.1
-"""The standard deviation by which ln size may change within a bundle although the distance is accounted for: a detector's
-boxes are less tight around small things. A larger value trusts growing boxes less."""
+"""The standard deviation of ln size within a bundle, after the distance is accounted for. A detector's boxes are less tight
+around small things. A larger value trusts growing boxes less."""
 
 
 @dataclass(frozen=True)
 class Bundles:
     """G = 2 S bundles of S landmarks. The bundles of landmark i are 2 i and 2 i + 1.
 
-    ray, group: (P,) the rays, and the bundle of each. landmark: (G,) of each bundle. noise: (G,) factor on the noise of its
-    rays. counted: (G,) how many boxes count as independent.
+    ray, group: (P,) the rays, and the bundle of each. landmark: (G,) the landmark of each bundle. noise: (G,) the factor on
+    the noise of its rays. counted: (G,) how many of its boxes count as independent.
     """
 
     usual: UsualViews
@@ -37,7 +37,7 @@ class Bundles:
     counted: Ints
 
     def take(self, which: Ints) -> Bundles:
-        """Return the bundles `which`, ascending, and their rays."""
+        """Return the bundles with the ascending indices `which`, and their rays."""
         number = np.full(self.count, -1)
         number[which] = np.arange(len(which))
         mine = number[self.group] >= 0

@@ -17,7 +17,7 @@ def learned(state: State) -> State:
     """Return the state with a ratio of appearances that is learnt from its present landmarks."""
     obs = state.obs
     ratio = learn_ratio(obs, obs.frame, obs.track, state.matched, len(state.unassigned))
-    return state if ratio is state.ratio is None else replace(state, ratio=ratio)  # A new state would compute all anew.
+    return state if ratio is state.ratio is None else replace(state, ratio=ratio)  # A new state would compute all again.
 
 
 def annealed(state: State, gate: float, settle: Callable[[State], State]) -> State:

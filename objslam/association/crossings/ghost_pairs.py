@@ -1,9 +1,10 @@
 """Replace two landmarks at crossings by the two things whose rays cross there.
 
 Seen from two stretches of the path, two things of one label have four points where rays meet: the things, and two ghosts.
-The rays of each ghost come from both things. Both ghosts together have as many rays as the things, and the rays of a short
-look fit them. So no ray fits the other landmark better, and a search that takes the points one by one may find the ghosts
-first. Only rays from a third side reveal the ghosts: both ghosts fit them worse than other landmarks fit their rays.
+The rays of each ghost come from both things. Both ghosts together have as many rays as the things. The rays from a short
+part of the path fit the ghosts well. So no ray fits the other landmark better, and a search that takes the points one by one
+may find the ghosts first. Only rays from a third side reveal the ghosts: both ghosts fit them worse than other landmarks fit
+their rays.
 """
 
 from __future__ import annotations
@@ -28,18 +29,18 @@ slower."""
 _POINTS = 120
 """The most proposed points that are tried in pairs. A larger number is slower: all pairs of points are scored."""
 _RAYS = 300
-"""The number of rays that score pairs of points. These rays also compare the best pair with the two landmarks. Only if the
-pair is better by them, all rays compare it too. A larger number is slower."""
+"""The number of rays that score pairs of points. The same rays then compare the best pair with the two landmarks. All rays
+compare them only if the pair is better by these few. A larger number is slower."""
 _LEAST_GAIN = 30.0
-"""Two new points replace two landmarks if they lower -2 ln of the likelihood of the landmarks' rays by at least this. Rays
-share errors, so that a small decrease is chance. With a larger value, fewer ghosts are replaced."""
+"""The least decrease of -2 ln of the likelihood of two landmarks' rays with which two new points replace the landmarks. Rays
+share errors, so a small decrease may be chance. With a larger value, fewer ghosts are replaced."""
 _STEPS = 4
 """The rounds of assigning the rays to two points and refining the points. More rounds are more exact, and slower."""
 _GAUSSIAN = 2.0
 """The mean squared deviation of a landmark's own rays, if their noise is as expected (chi-squared, 2 degrees of freedom). A
 larger value tries fewer pairs."""
 _LEAST_SIN2 = np.sin(np.radians(5.0)) ** 2
-"""The least squared sine of the angle between two rays that propose a point. A larger angle proposes surer points, and
+"""The least squared sine of the angle between two rays that propose a point. With a larger angle, the points are surer, but
 fewer."""
 
 
@@ -49,8 +50,8 @@ def replace_ghosts(state: State, gate: float, tried: set[bytes], seed: int = 0) 
     Args:
         state: landmarks at solved or given poses.
         gate: the squared deviation of a ray that belongs to no landmark.
-        tried: the rays of pairs that were tried at these poses. They are not tried again, and the new ones are added.
-        seed: of the random pairs of rays.
+        tried: the rays of each pair that was tried at these poses. Such a pair is not tried again. New pairs are added.
+        seed: the seed of the random pairs of rays.
     Returns:
         The state with new positions, and with the rays assigned to them. The same state if no pair was replaced.
     """
@@ -127,6 +128,6 @@ def _settled(obs: Observations, points: Floats, noise: float, gate: float) -> tu
 
 
 def _costs(obs: Observations, points: Floats, noise: float, gate: float) -> Floats:
-    """Return -2 ln likelihood (P, R) of each ray for each of P points, as `ray_costs`."""
+    """Return -2 ln likelihood (P, R) of each ray for each of P points, as in `ray_costs`."""
     every = np.tile(np.arange(len(obs)), len(points))
     return ray_costs(obs, np.repeat(points, len(obs), axis=0), noise, gate, every).reshape(len(points), -1)

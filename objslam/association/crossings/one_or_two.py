@@ -44,16 +44,17 @@ Perspective alone gives this share for a cube that is seen from six times its si
 things."""
 _TRIES = 1
 """A landmark is not split again if its rays were in split landmarks this many times on average. The rays of some landmarks
-come back after each split: of 17 in a drive between cones, the same ones up to eight times. A larger number takes longer."""
+come back after each split. In a drive between cones, 17 landmarks were split, some of them up to eight times. A larger
+number takes longer."""
 _FREE = 3
-"""The degrees of freedom of a second point."""
+"""The degrees of freedom of a second point: its three coordinates."""
 _USUAL_GAIN = 2.366
-"""Two points explain the rays of one thing better than one point does. This is the median decrease of the cost, the median
-of chi-squared with `_FREE` degrees of freedom."""
+"""The median decrease of the cost of the rays of one thing if two points explain them instead of one. It is the median of
+chi-squared with `_FREE` degrees of freedom."""
 _USUAL_GAINS = ((0.5, _USUAL_GAIN), (0.8, 4.642))
 """Two probabilities, each with its quantile of chi-squared with `_FREE` degrees of freedom. Errors that last for a while,
-such as the slip of a wheel, concern only some landmarks. They show in the second quantile. If one landmark in five is two
-things, this does not change the second quantile."""
+such as the slip of a wheel, concern only some landmarks. Such errors show in the second quantile. The second quantile stays
+the same if one landmark in five is two things."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,8 @@ class Crossings:
     """S landmarks whose rays come in two bundles.
 
     landmark: (S,). second: (R,) whether a ray is in the second bundle of its landmark. odds: (S,) log odds that the landmark
-    is one thing. A positive value can be too small. position: (S, 2, 3) m, where its two things would be.
+    is one thing. A positive value may be only a lower bound. position: (S, 2, 3) m, where the two things of the landmark
+    would be.
     """
 
     landmark: Ints
@@ -75,9 +77,11 @@ class Crossings:
         return self.odds < -_CLEAR
 
     def untried(self, state: State, tries: Ints) -> Bools:
-        """Return which landmarks (S,) are clearly two things, and were not split `_TRIES` times already.
+        """Return which landmarks (S,) are clearly two things and were not tried yet. The rays of such a landmark were in
+        split landmarks fewer than `_TRIES` times on average.
 
-        state: that of the landmarks. tries: (R,) how often each ray was in a split landmark. It counts these landmarks too.
+        state: the state with the landmarks. tries: (R,) how often each ray was in a split landmark. The rays of the returned
+        landmarks are counted in it.
         """
         number = np.bincount(state.owner, minlength=state.count)
         before = np.bincount(state.owner, tries[state.assigned], state.count) / np.maximum(number, 1)
@@ -105,7 +109,7 @@ def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
     ray = state.assigned[np.isin(state.owner, two)]
     group = 2 * np.searchsorted(two, state.matched[ray]) + second[ray]
     number, landmark = np.bincount(group, minlength=2 * len(two)), np.repeat(two, 2)
-    # The noise of the class, because a landmark that is two has much noise of its own.
+    # This is the noise of the class, because a landmark that is two things has much noise of its own.
     noise = state.class_noise[state.label[landmark]]
     bundles = Bundles(UsualViews.of(state, sized), ray, group, landmark, noise, np.minimum(number, COUNTED))
     one, one_cost = _as_one(bundles)
@@ -115,7 +119,7 @@ def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
     two_things = _as_two((_most(bundles, free), free_cost), (other, other_cost))
     odds = one - (two_things[0] + _bearing_odds(one_cost - two_things[1], excess, len(two))).max(axis=0)
     position, open_ = free.position.copy(), np.flatnonzero(odds < 0)
-    if len(open_):  # Only these can be two. To try all distances takes most of the time.
+    if len(open_):  # Only these can be two things. Trying all distances takes most of the time.
         pair = (2 * open_[:, None] + np.arange(2)).ravel()
         alone, alone_cost, position[pair] = _alone(bundles.take(pair), free.take(pair))
         two_things = _as_two((alone, alone_cost), (other[pair], other_cost[pair]))
@@ -204,7 +208,7 @@ def _bearing_odds(gain: Floats, excess: Floats, landmarks: int) -> Floats:
     The excess comes from a limited number of landmarks, so the odds are from an F distribution.
 
     gain: (K, S) by how much K explanations of S landmarks as two things lower the cost of the rays. excess: (S,) from
-    `excess_of`. landmarks: the number of gains that gave it.
+    `excess_of`. landmarks: the number of gains from which the excess was computed.
     """
     number = landmarks - 1 + _ASSUMED
     tail = 0.5 * (number + _FREE) * np.log1p(np.maximum(gain, 0.0) / (excess * number))
@@ -272,7 +276,7 @@ def _as_another(bundles: Bundles) -> tuple[Floats, Floats]:
     saved = np.bincount(pair, STRAY_RAY - edges.deviation[useful], len(pairs))
     order = np.argsort(saved, kind="stable")
     to, most = np.full(bundles.count, -1), np.zeros(bundles.count)
-    to[pairs[order] // state.count] = pairs[order] % state.count  # The last one stays, which saves most.
+    to[pairs[order] // state.count] = pairs[order] % state.count  # The last one stays. It saves most.
     most[pairs[order] // state.count] = saved[order]
     at = state.landmarks.position[to]
     size, growth = bundles.size(at)
@@ -283,7 +287,7 @@ def _as_another(bundles: Bundles) -> tuple[Floats, Floats]:
 
 
 def _size_odds(size: Floats, mean: Floats, variance_: Floats) -> Floats:
-    """Return the log likelihood (N,) of ln sizes (N,) with a mean and a variance (N,), 0 where one of them is not known.
-    Some views show only a part of a thing."""
+    """Return the log likelihood (N,) of ln sizes (N,) with a mean and a variance (N,). It is 0 where a size or a mean is not
+    known. It allows for views that show only a part of a thing."""
     normal = np.exp(-0.5 * (size - mean) ** 2 / variance_) / np.sqrt(2 * np.pi * variance_)
     return np.nan_to_num(np.log((1 - _HIDDEN) * normal + _HIDDEN / _HIDDEN_WIDTH))

@@ -1,4 +1,4 @@
-"""Where the thing of a bundle of rays can be, by its bearings."""
+"""Find where the thing of a bundle of rays can be, from the bearings."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def fit_points(bundles: Bundles, index: Ints, landmark: Ints, noise: Floats, sta
     Returns the positions (N, 3) m, ln of their volumes (N,) m^3, and their largest standard deviations (N,) m over all
     directions. A volume is (2 pi)^1.5 times the root of the determinant of the covariance (Laplace's method). Without
     parallax, the usual distance of the class limits the volume and the standard deviation. index: (P,) the group of each
-    ray. landmark, noise: (N,) of each group.
+    ray. landmark, noise: (N,) the landmark and the noise factor of each group.
     """
     state, ray, count = bundles.state, bundles.ray, len(landmark)
     position = refine(state.obs, ray, index, start, noise)

@@ -12,21 +12,23 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.statistics import NORMAL_MEDIAN, grouped_median, grouped_quantile
 
 _USUAL = 0.9
-"""The share of the boxes of a landmark that are usually near. Further away, detections become rare. A larger share allows
-landmarks further away."""
+"""The share of a landmark's boxes that come from within its usual distance. Further away, detections become rare. A larger
+share allows landmarks further away."""
 _LARGER = 1.4
-"""A box may be this many times as far away as the other boxes of its class. A thing that is larger than others of its class
-by half of `_CLASS_SIZE` is detected from further away by this factor. A larger factor allows landmarks further away."""
+"""The factor by which a box may be further away than the other boxes of its class. A thing that is larger than others of its
+class by half of `_CLASS_SIZE` is detected from further away by this factor. A larger factor allows landmarks further
+away."""
 _BOXES = 50
-"""A class with fewer boxes of other landmarks takes the distances of all classes. With a larger number, more classes take
-them."""
+"""The least number of boxes of other landmarks with which a class has distances of its own. A class with fewer boxes takes
+the distances of all classes. With a larger number, more classes do so."""
 _LANDMARKS = 3
-"""A class with fewer other landmarks takes the usual distance of all classes. With a larger number, more classes take it.
-One of three landmarks may be wrong without effect on their median."""
+"""The least number of landmarks with which a class has a usual distance of its own. A class with fewer landmarks takes the
+usual distance of all classes. With a larger number, more classes do so. One of three landmarks may be wrong without effect
+on their median."""
 _VIEW_SIZE, _THINGS = 0.25, 5.0
-"""`_VIEW_SIZE` is the assumed standard deviation of ln size between two views of one thing, as in `gating`. With `_THINGS`
-landmarks, the measured deviation has the same weight as the assumed one. With a larger deviation, sizes count less. With a
-larger number, the assumed deviation counts longer."""
+"""`_VIEW_SIZE` is the assumed standard deviation of ln size between two views of one thing. It is the same as `SIZE_SPREAD`
+in `observations`. With `_THINGS` landmarks, the measured deviation has the same weight as the assumed one. With a larger
+deviation, sizes count less. With a larger number, the assumed deviation counts longer."""
 _CLASS_SIZE, _OF_CLASS = 0.7, 3.0
 """`_CLASS_SIZE` is the assumed standard deviation of ln size within a class: sizes differ by a factor of 2. With `_OF_CLASS`
 landmarks, the measured deviation has the same weight as the assumed one. With a larger deviation, the size says less about
@@ -39,20 +41,20 @@ _MARGIN = (2.0, 2.0, 0.3)
 """The lengths (m) by which the mapped space exceeds the landmarks, along the axes of the map. Larger lengths mean a lower
 density of things."""
 _INNER = 0.9
-"""The share of the landmarks, along each axis, that define how large the mapped space is. With a larger share, wrong
-landmarks far away enlarge it."""
+"""The share of the landmarks that define how large the mapped space is along each axis. With a larger share, wrong landmarks
+far away enlarge it."""
 
 
 @dataclass(frozen=True)
 class UsualViews:
     """What is usual for each of N landmarks, according to the other landmarks of its class.
 
-    state: the landmarks. distance: (N,) m, most boxes of the class come from within this distance. log_density: (N,) ln of
-    the number of things of the class per m^3. ln_size: (R,) ln of the width or of the height of the thing in each box per m
-    of its distance, whichever scatters less. It is NaN for a box without a size. size: (N,) the median ln size of each
-    landmark, NaN if it has few boxes. view: the standard deviation of ln size between views of one thing. class_mean,
-    class_spread: (N,) mean and standard deviation of ln size among the other landmarks of the class. The mean is NaN if
-    there are none.
+    state: the landmarks. distance: (N,) m, the distance within which most boxes of the class lie. log_density: (N,) ln of
+    the number of things of the class per m^3. ln_size: (R,) ln of the width or of the height of the thing in each box, in m
+    per m of its distance. The side is taken whose sizes scatter less. The value is NaN for a box without a size. size: (N,)
+    the median ln size of each landmark, NaN if it has few boxes. view: the standard deviation of ln size between views of
+    one thing. class_mean, class_spread: (N,) mean and standard deviation of ln size among the other landmarks of the class.
+    If the class has no others, all other landmarks count. The mean is NaN without other landmarks.
     """
 
     state: State
@@ -66,7 +68,7 @@ class UsualViews:
 
     @classmethod
     def of(cls, state: State, sized: Bools) -> UsualViews:
-        """Take what is usual from a state. sized: (R,) whether the camera of each ray observes sizes."""
+        """Find what is usual among the landmarks of a state. sized: (R,) whether the camera of each ray observes sizes."""
         count = state.count
         told = sized & (state.obs.size > 0).all(axis=1)
         ln_size = np.log(np.where(told[:, None], state.obs.size, np.nan))
@@ -121,7 +123,8 @@ class UsualViews:
 
 
 def _distances(state: State) -> Floats:
-    """Return the usual distance (N,) m of the class of each landmark: the median over its landmarks, or over all."""
+    """Return the usual distance (N,) m of the class of each landmark. It is the median over the landmarks of the class, or
+    over all landmarks if the class has few."""
     own = grouped_quantile(state.distance, state.owner, state.count, _USUAL)
     some = np.flatnonzero(np.isfinite(own))
     if not len(some):
@@ -142,7 +145,7 @@ def _log_density(state: State) -> Floats:
 def _of_class(size: Floats, label: Ints) -> tuple[Floats, Floats]:
     """Return mean and standard deviation (N,) of ln size (N,) among the other landmarks of each landmark's class.
 
-    If there are none, the values of all other landmarks are taken.
+    Without others in the class, the mean is that of all other landmarks, and the deviation is twice `_CLASS_SIZE`.
     """
     count = len(size)
     mean, spread = np.full(count, np.nan), np.full(count, 2 * _CLASS_SIZE)

@@ -30,19 +30,20 @@ _MOVING = 6
 rays."""
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
 _TURNS = 8
-"""The most searches among the unassigned rays. They end once a search finds nothing. A larger number may find more."""
+"""The most searches among the unassigned rays. No further search follows one that finds nothing. A larger number may find
+more."""
 _POWER = 0.4
 """The log odds against strays are multiplied by this factor, and then become a probability. The factor is below 1, because
 boxes of near objects mix, so strays are not independent. On 10 simulated streets (`tools/bench_association.py`), 0.4 makes
 the probabilities about 0.1 too large. A larger factor makes the probabilities larger."""
 _PLACE_ROUNDS = 2
-"""How often the places are corrected, and the search is repeated. A third time gave the same objects on 30 simulated
+"""The number of rounds that correct the places and repeat the search. A third round gave the same objects on 30 simulated
 streets. A larger number takes longer."""
 _FIRST = 0.7
 """The noise of the places in the first search, as a share of the noise in the settings. With wide gates, near objects become
-one, and then they show no errors of places. On 30 simulated streets with the right noise in the settings, 0.7 and 1 give the
-same objects. With 1.2 times the true noise in the settings, 0.7 is better. With a smaller share, unusually large errors
-are not found."""
+one object, and then the rays show no errors of places. On 30 simulated streets with the right noise in the settings, 0.7 and
+1 give the same objects. With 1.2 times the true noise in the settings, 0.7 is better. With a smaller share, unusually large
+errors are not found."""
 _SAMPLE = 512  # The most rays of one label in a search. The time grows with the square of this number.
 _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
 
@@ -52,8 +53,8 @@ def add_few_ray_objects(
 ) -> Association:
     """Add the objects that can be found from a few unassigned rays. They come after the other objects.
 
-    The association stays as it is if the poses are not localised, if the settings do not allow the search, if the
-    association has no probability that its objects exist, or if too few rays are free for another object.
+    The association stays as it is in four cases. The poses are not localised. The settings do not allow the search. The
+    association has no probability that its objects exist. Too few rays are free for another object.
 
     positions: (N, 3) m of the objects, NaN where unknown. seed: the seed of the random pairs of rays.
     """
@@ -82,12 +83,12 @@ def add_few_ray_objects(
 
 @dataclass(frozen=True)
 class FewRayEvidence:
-    """How well the objects that a search finds among all rays explain the boxes.
+    """The measures of how well the objects that a search finds among all rays explain the boxes.
 
     chance: the log odds of these objects over boxes that are all stray. detections: ln of the probability of the objects'
-    detections and misses. explained: the share of the boxes with an object. ray, owner: (P,), (P,) the rays with an object,
-    and their objects. moment: (P,) the index of the moment of each ray. shift: (P, 3) m, from the given to the corrected
-    origin of each ray. positions: (N, 3) m of the objects.
+    detections and misses. explained: the share of the boxes with an object. ray, owner: (P,) the rays with an object, and
+    their objects. moment: (P,) the index of the moment of each ray. shift: (P, 3) m, from the given to the corrected origin
+    of each ray. positions: (N, 3) m of the objects.
     """
 
     chance: float
@@ -178,7 +179,7 @@ class _Few:
         return few, found
 
     def with_places_of(self, joined: State) -> "_Few":
-        """Return the search from corrected places. The landmarks `joined`, which are all of them, show the errors of the
+        """Return the search from corrected places. joined: all landmarks, known and new. They show the errors of the
         places."""
         obs = self.known.obs
         errors = place_errors(replace(joined, obs=obs))
@@ -236,7 +237,7 @@ class _Few:
         return found.merge(own).keep(~taken[known:][own == np.arange(found.count)])
 
     def dropped(self, found: State, least: float) -> State:
-        """Drop landmarks until all that are left are likely enough to exist. `better_neighbours` stay for one more turn."""
+        """Drop landmarks until all landmarks left are likely enough to exist. `better_neighbours` stay for one more turn."""
         while (failing := self.existence(found) < least).any():
             left = self.settled(found.keep(~failing | better_neighbours(found, failing, self.gate)))
             if left.count == found.count:

@@ -59,7 +59,8 @@ class _Density:
 
     @classmethod
     def of(cls, x: Floats, label: Ints, labels: int, noise: Floats, reach: float = 0.0) -> "_Density":
-        """Estimate densities from values (R,) and their noise (L,), with a Gaussian kernel. Values can reach `reach`.
+        """Estimate densities from values (R,) and their noise (L,), with a Gaussian kernel. reach: the largest absolute
+        value that is possible, 0 if unknown.
 
         Few boxes leave gaps between their kernels. So a uniform density is added. Its weight is larger if fewer boxes lie in
         a kernel.
@@ -99,7 +100,7 @@ def _bins(x: Floats, low: float, width: float) -> Ints:
 class Strays:
     """The density of stray boxes.
 
-    image: (R,) sr^-1, the density, at the place of a ray in the image, of the boxes of its label. frames: the number of
+    image: (R,) sr^-1, the density of the boxes of a ray's label at the place of the ray in the image. frames: the number of
     frames. log_range: the densities of ln range, None if no ray has a range. ranged: (L,) the share of boxes with a range.
     """
 
@@ -125,7 +126,7 @@ class Strays:
         noise = np.nan_to_num(grouped_median(angle, obs.label, labels))
         wide = min(max(camera.view_angle for camera in view.cameras), np.pi)
         columns = (np.arctan2(x, z), wide), (y, min(view.solid_angle / (4 * wide), 1.0))
-        image = np.full(len(obs), 1 / obs.scale)  # In a flattened world, as many boxes fill a smaller solid angle.
+        image = np.full(len(obs), 1 / obs.scale)  # In a flattened world, the same boxes fill a smaller solid angle.
         for column, reach in columns:
             image *= _Density.of(column, obs.label, labels, noise, reach).at(column, obs.label)
         if not len(known):
@@ -163,9 +164,9 @@ def ray_odds(
 ) -> tuple[Floats, Floats]:
     """Return the log odds (..., R) that each ray shows its point and is no stray, and the density of strays, m^-2.
 
-    number: (..., R) strays of the label in the log. off2: (..., R) m^2, the squared distance of the point from the ray.
-    distance: (..., R) m, from the camera. noise: factor on the noise of the rays. A deviation beyond `gate` costs as much as
-    one at the gate.
+    number: (..., R) the number of strays of the ray's label in the log. off2: (..., R) m^2, the squared distance of the
+    point from the ray. distance: (..., R) m, of the point from the camera. noise: factor on the noise of the rays. A
+    deviation beyond `gate` costs as much as one at the gate.
     """
     # The tables can be of hundreds of points and all rays, so each is changed in place where that is possible.
     distance2 = distance**2
@@ -203,8 +204,8 @@ def unmatched_costs(state: State, edges: Edges, strays: Strays, gate: float) -> 
     """Return for each match the cost (E,) of its ray if the ray had no landmark.
 
     It is -2 ln of the density of strays, relative to the density of the landmark's rays at their peak, and at most `gate`.
-    So it matters only where strays are dense compared with the noise of the rays. Boxes within the gate of the landmark do
-    not count as strays.
+    So it is below `gate` only where strays are dense compared with the noise of the rays. Boxes within the gate of the
+    landmark do not count as strays.
     """
     obs, noise = state.obs.take(edges.ray), state.landmarks.noise[edges.landmark]
     distance = np.linalg.norm(state.landmarks.position[edges.landmark] - obs.origin, axis=1)
@@ -217,8 +218,8 @@ def unmatched_costs(state: State, edges: Edges, strays: Strays, gate: float) -> 
 def chance_odds(state: State, gate: float, strays: Strays, rates: Rates) -> Floats:
     """Return the log odds (N,) of one object over stray boxes, from the rays of each landmark. Misses do not count.
 
-    If the rays show one object, its position x is anywhere where boxes of its label are, and p(rays) = int p(x) prod p(ray |
-    x) dx by Laplace's method. If they are strays, each box has the density of the label's strays.
+    If the rays show one object, its position x may be anywhere where boxes of its label are. Then p(rays) = int p(x) prod
+    p(ray | x) dx, by Laplace's method. If the rays are strays, each box has the density of the label's strays.
     """
     total, label = _evidence(state, gate, strays, rates), state.label
     grid = _likelihoods(total, _looks(state), label, *_expected(state, rates))
@@ -251,9 +252,9 @@ def _evidence(state: State, gate: float, strays: Strays, rates: Rates) -> Floats
 def _looks(state: State) -> Floats:
     """Return the number (N,) of independent looks at each landmark.
 
-    Strays from nearly one place are often one thing: an error that the detector repeats in the next image, or an object
-    that moves slowly. So the weight of a ray is the angle, seen from the landmark, between it and the ray before it, divided
-    by `_LOOK`. The weight is at most 1, and the first ray has the weight 1.
+    Strays from nearly one place are often one thing: an error that the detector repeats in the next image, or an object that
+    moves slowly. So the weight of a ray is its angle to the ray before it, seen from the landmark, divided by `_LOOK`. The
+    weight is at most 1, and the first ray has the weight 1.
     """
     order = np.lexsort((state.obs.frame[state.assigned], state.owner))
     owner = state.owner[order]
@@ -279,7 +280,7 @@ def _likelihoods(odds: Floats, number: Floats, label: Ints, boxes: Ints, objects
     numbers of strays and objects are Poisson distributed. The mean number of strays is c n, for n boxes. The mean number of
     objects is m times the nominal number. Then the likelihood is c^n exp(-c n - m objects), times a factor for each
     landmark. This factor is 1 + m o c^-k for a landmark with k rays whose odds are o at c = m = 1. odds: (N,) ln o. number:
-    (N,) k. label: (N,). boxes, objects: (L,) the numbers of boxes, and the nominal numbers of objects.
+    (N,) k. label: (N,) of the landmarks. boxes, objects: (L,) the numbers of boxes, and the nominal numbers of objects.
     """
     log_share, log_density = np.log(_SHARES), np.log(_DENSITY_FACTORS)
     grid = np.zeros((len(boxes), _TRIED, _TRIED))

@@ -1,7 +1,7 @@
 """Estimate the errors of the places from which a log was recorded, such as places by GPS.
 
-All boxes of one moment share the error of the place of this moment. A box alone cannot show it. But if several boxes of a
-moment have landmarks that other moments see too, the error follows from all of them together.
+All boxes of one moment share the error of the place of this moment. A box alone cannot show this error. But if several boxes
+of a moment have landmarks that other moments also see, the error follows from all of them together.
 """
 
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ _HALF = 3.0
 """The squared deviation at which a ray has half of its full weight. On 30 simulated streets, 2 and 4 give the same objects,
 and 6 finds 1 % fewer. With a larger value, rays of other things pull more."""
 _DENSE = 500
-"""The normal equations are a dense matrix up to this number of landmarks, because things in a room are seen together. With
-more landmarks the matrix is sparse, because they lie along a way, and hardly any two are seen from one place. With a larger
-number, the time of large maps grows with its cube."""
+"""The largest number of landmarks with which the normal equations are a dense matrix, because things in a room are seen
+together. With more landmarks, the matrix is sparse, because the things lie along a way, and hardly any two are seen from one
+place. With a larger number, the time of large maps grows with its cube."""
 _STEPS = 8
-"""The steps of the robust fit. A larger number is more exact and slower."""
+"""The number of steps of the robust fit. A larger number is more exact and slower."""
 _WIDE = 3
 """The number of first steps in which the errors of the places count as noise of the residuals. Later steps estimate these
 errors. With fewer first steps, rays of other things pull more."""
@@ -30,7 +30,7 @@ errors. With fewer first steps, rays of other things pull more."""
 @dataclass(frozen=True)
 class PlaceErrors:
     """The estimated errors of G places. offset: (G, 3) m, from the given to the estimated place, in map. sigma: (G,) m, the
-    standard deviation of its error along each axis. place: (R,) the place of each ray."""
+    standard deviation of the estimated place along each axis. place: (R,) the place of each ray."""
 
     offset: Floats
     sigma: Floats
@@ -46,8 +46,8 @@ def place_errors(state: State) -> PlaceErrors:
     """Estimate the errors of all places from the rays that have a landmark.
 
     The landmarks and the places are the least-squares solution of the rays, with Cauchy weights, and with the noise of the
-    origins as the prior of the places. The sigma of a place allows for errors of the landmarks, because other places, with
-    errors of their own, see them too.
+    origins as the prior of the places. The sigma of a place includes the errors of the landmarks. These errors come from the
+    other places that see the landmarks.
     """
     held, owner, count = state.assigned, state.owner, state.count
     obs, prior = state.obs.take(held), state.obs.position_sigma**2
@@ -77,8 +77,9 @@ def _solved(
 ) -> tuple[Floats, Floats]:
     """Return the positions (N, 3) and the offsets (G, 3) that minimise the weighted squares of `position - offset - told`.
 
-    weight: (P, 3, 3) m^-2. told: (P, 3) m. owner, of: (P,) the landmark and the place of each ray. prior: m^2, the variance
-    of an offset. A landmark stays at its position in directions that no ray observes.
+    weight: (P, 3, 3) m^-2, of each ray. told: (P, 3) m, where each ray says that its landmark is. owner, of: (P,) the
+    landmark and the place of each ray. prior: m^2, the variance of an offset. A landmark stays at its position in directions
+    that no ray observes.
     """
     from scipy.sparse import bsr_array
     from scipy.sparse.linalg import spsolve

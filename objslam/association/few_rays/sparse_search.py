@@ -43,8 +43,8 @@ class SparseSearch:
 def discover_sparse(obs: Observations, search: SparseSearch) -> Floats:
     """Return the points (N, 3) m on which rays of one label agree better than by chance. The surest point comes first.
 
-    A point takes the rays with positive odds, at most one in each frame. A surer point can take one of its rays. Then the
-    point is judged again without this ray.
+    A point takes the rays with positive odds, at most one in each frame. If a surer point takes one of its rays, the point
+    is judged again without this ray.
     """
     points, free, found = _propose(obs, search), np.ones(len(obs), dtype=bool), list[Floats]()
     while len(points):
@@ -133,7 +133,7 @@ def _judge(obs: Observations, points: Floats, free: Bools, search: SparseSearch)
         np.maximum(off2, 0.0, out=off2)
         odds, density = ray_odds(obs, strays, search.number, off2, distance, 1.0, search.gate)
         odds[depth <= MIN_DEPTH] = -np.inf
-        # Most rays have no positive odds at a point, so the rest is computed only for rays with positive odds.
+        # Most rays have no positive odds at a point. Everything below is computed only for rays with positive odds.
         point, ray = np.nonzero(odds > 0)
         best = np.maximum.reduceat(odds, begin, axis=1)[point, of_frame[ray]]
         point, ray = (some[odds[point, ray] == best] for some in (point, ray))

@@ -2,9 +2,9 @@
 
 A path that is bent onto wrong landmarks fits them well, so no small change improves it. This search is global: it tries to
 move each stretch of the path from wrong landmarks to landmarks beside them. It is Markov localisation on a grid (Fox,
-Burgard and Thrun 1999). The states of a short stretch of the path are planar corrections of it, a turn and a shift. The rays
-show how well a state fits the map. The odometry shows how well the states of two stretches fit together. Dynamic programming
-finds the most likely states of all stretches (Viterbi 1967).
+Burgard and Thrun 1999). The states of a short stretch of the path are planar corrections of the stretch. Each state is a
+turn and a shift. The rays show how well a state fits the map. The odometry shows how well the states of two stretches fit
+together. Dynamic programming finds the most likely states of all stretches (Viterbi 1967).
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from objslam.core.types import Keyframes, Rays
 
 _STEPS_APART = 4.0
 """The number of grid steps between neighbouring landmarks of one label. With a larger number, the grid is finer and reaches
-less far: it reaches `_SHIFTS` / `_STEPS_APART` neighbours."""
+less far. It reaches `_SHIFTS` / `_STEPS_APART` neighbours."""
 _MOST_TURN = np.radians(1.0)
 """The largest grid step (rad) in yaw. The step of shifts is this turn at the median distance of landmarks. A larger value
 finds larger errors of the path. The heading of a solved path errs by 14 degrees at most."""
@@ -29,8 +29,8 @@ finds larger errors of the path. The heading of a solved path errs by 14 degrees
 
 @dataclass(frozen=True)
 class LikelyPath:
-    """The most likely path. map_T_base: (K, 4, 4). turn, shift: rad and m, rough standard deviations of the errors that the
-    steps of the grid cause in its poses."""
+    """The most likely path. map_T_base: (K, 4, 4) the poses. turn, shift: rad and m, rough standard deviations of the errors
+    that the steps of the grid cause in the poses."""
 
     map_T_base: Floats
     turn: float
@@ -38,21 +38,22 @@ class LikelyPath:
 
     @property
     def pose_covariance(self) -> Floats:
-        """(6, 6) of each pose, rotation first."""
+        """The covariance (6, 6) of each pose, rotation (rad) first, then position (m)."""
         return np.diag([self.turn**2] * 3 + [self.shift**2] * 3)
 
 
 def most_likely_path(
     keyframes: Keyframes, rays: Rays, map_T_base: Floats, positions: Floats, label: Ints, rate: Floats
 ) -> LikelyPath | None:
-    """Return the most likely path through a map, None if no label has two landmarks that could be confused.
+    """Return the most likely path through a map. Return None without rays, and if no label has two landmarks that could be
+    confused.
 
     Corrections are planar like the drift of wheels. They reach as far as a few neighbouring landmarks. A match with a
     landmark that is rarely detected costs more, so a second copy of a landmark loses its rays. A frame may give two rays to
     one landmark.
 
-    keyframes: with odometry. map_T_base: (K, 4, 4) the present path. positions, label: (N, 3) m and (N,) of the landmarks,
-    NaN without a position. rate: (N,) the share of the frames in view of each landmark that detect it.
+    keyframes: the keyframes, with odometry. map_T_base: (K, 4, 4) the present path. positions, label: (N, 3) m and (N,) of
+    the landmarks, NaN without a position. rate: (N,) the share of the frames in view of each landmark that detect it.
     """
     from scipy.spatial import cKDTree
 

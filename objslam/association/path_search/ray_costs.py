@@ -1,4 +1,4 @@
-"""For each stretch of a path, the cost of its rays in each state."""
+"""Compute the cost of the rays of each stretch of a path, in each state of the stretch."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ from objslam.core.types import Rays
 _LANDMARK_SIGMA = 0.03
 """The assumed standard deviation (m) of a landmark's position. A larger value accepts rays farther from landmarks."""
 _NEAR = 4.0
-"""The number of standard deviations beyond the grid up to which a landmark counts for a ray. At 4, its cost exceeds the cost
-of a stray ray. A larger value takes longer."""
+"""The number of standard deviations beyond the grid up to which a landmark counts for a ray. At 4, a match costs more than a
+stray ray. A larger value takes longer."""
 _RAYS_AT_ONCE = 2000
-"""About how many rays are compared with the map together. A larger number needs more memory."""
+"""The approximate number of rays that are compared with the map together. A larger number needs more memory."""
 
 
 @dataclass(frozen=True)

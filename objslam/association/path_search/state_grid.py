@@ -12,35 +12,36 @@ from objslam.core.types import Keyframes
 _SHIFTS, _TURNS = 9, 14
 """The number of grid steps to each side, along x and y, and in yaw. Larger numbers reach farther, and take longer."""
 STRETCH = 0.5
-"""The drift of the heading in a stretch, in grid steps (one standard deviation). A larger value makes longer stretches, in
-which the odometry counts as exact."""
+"""The largest standard deviation of the drift of the heading in a stretch, in grid steps of yaw. A larger value makes longer
+stretches, in which the odometry counts as exact."""
 _STRETCH_SHIFTS = 2.0
-"""The length of a stretch, in grid steps. A larger value makes longer stretches, for which a single correction is less
-exact."""
+"""The greatest length of a stretch, in grid steps of a shift. A larger value makes longer stretches, for which a single
+correction is less exact."""
 
 Cells = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The states: all combinations of shifts along x and along y, and of turns. shift: m, and turn: rad, the steps."""
+    """The states: all combinations of shifts along x and along y, and of turns. shift: m, turn: rad, the sizes of the grid
+    steps."""
 
     shift: float
     turn: float
 
     @cached_property
     def shifts(self) -> Floats:
-        """(X,) m, along x or y."""
+        """The shifts (X,) m along x or y."""
         return np.asarray(np.arange(-_SHIFTS, _SHIFTS + 1) * self.shift)
 
     @cached_property
     def turns(self) -> Floats:
-        """(Y,) rad, about the vertical axis."""
+        """The turns (Y,) rad about the vertical axis."""
         return np.asarray(np.arange(-_TURNS, _TURNS + 1) * self.turn)
 
 
 def stretches(keyframes: Keyframes, grid: Grid) -> Ints:
-    """Return the number (K,) of the stretch of each keyframe."""
+    """Return the index (K,) of the stretch of each keyframe."""
     assert keyframes.drift is not None
     assert keyframes.odom_T_base is not None
     heading = np.linalg.eigvalsh(keyframes.drift[:, :3, :3])[:, -1].tolist()  # rad^2

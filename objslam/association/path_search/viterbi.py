@@ -99,12 +99,13 @@ def most_likely_states(motions: Motions, costs: Iterator[Cells], grid: Grid) -> 
 
 
 def _steps_to(state: int, count: int) -> slice:
-    """Return indices into `Motions.costs`. They are of the steps from each of `count` states, in order, to `state`."""
+    """Return the indices in `Motions.costs` of the steps to `state` from each of `count` states, in increasing order."""
     return slice(state + count - 1, state - 1 if state else None, -1)
 
 
 def _reached(total: Cells, x: Cells, y: Cells, yaw: Cells) -> Cells:
-    """Return for each state the least sum (Y, X, X) of two costs: of a state before, and of the motion from there.
+    """Return for each state the least sum (Y, X, X) of two costs: the cost of a state before, and the cost of the motion
+    from it.
 
     A sum is at most `_SLIP`. Only states below `_SLIP` can lead to a smaller sum, so only the part of the grid that contains
     them is searched. This part is small where the rays show well where the robot is.

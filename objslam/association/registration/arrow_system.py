@@ -1,9 +1,9 @@
 """The linear system of a least-squares problem in which each measurement ties one object to one map.
 
 The matrix is an arrow: a block of 3 x 3 for each object, a block of w x w for each map, and blocks between an object and the
-maps that measured it. Either kind of unknowns can be eliminated first (Schur complement). The result is the same. The kind
-with fewer unknowns is left. So with few maps the time grows with the number of objects, and with few objects it grows with
-the number of maps.
+maps that measured it. The unknowns of the objects or those of the maps can be eliminated first (Schur complement). The
+result is the same. Here, the kind with more unknowns is eliminated. So with few maps, the time grows with the number of
+objects. With few objects, the time grows with the number of maps.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ singular."""
 class ArrowSystem:
     """The normal equations of N objects and S maps with w unknowns each, from R measurements.
 
-    objects: (N, 3, 3) and maps: (S, w, w), the blocks on the diagonal. pull: (R, 3, w) the block between object (R,) and map
-    (R,) of each measurement, with the sign of the derivative of the map's prediction. The matrix has -pull there. A map
-    measures an object once at most.
+    objects: (N, 3, 3) and maps: (S, w, w), the blocks on the diagonal. object, map: (R,) the object and the map of each
+    measurement. pull: (R, 3, w) the block between them, with the sign of the derivative of the map's prediction. The matrix
+    itself has -pull. A map measures an object once at most.
     """
 
     objects: Floats
@@ -55,7 +55,7 @@ class ArrowSystem:
 
         The first array is the part (N, 3, 3) that each object has alone. The second one is the part that is correlated
         between objects, as a factor (N, 3, m). The third one has the blocks (S, w, w) of the maps. If the system is
-        indeterminate, the second is 0 and the third is NaN.
+        indeterminate, the second array is 0 and the third is NaN.
         """
         inverse = np.linalg.inv(self.objects)
         own = np.asarray((inverse + np.swapaxes(inverse, 1, 2)) / 2, dtype=np.float64)

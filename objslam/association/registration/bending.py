@@ -2,7 +2,8 @@
 
 A wrong tilt or size moves a far object by more than a near one. So a transform alone may match the objects of a row to the
 neighbours of their true partners. Here, tilt and size are estimated together with the transform. The shared covariances of
-the maps are their priors. A tilt and a size cannot move each object its own way. Independent errors of objects could.
+the maps are the priors of tilt and size. Unlike independent errors of objects, a tilt and a size cannot move each object its
+own way.
 """
 
 import numpy as np
@@ -20,15 +21,16 @@ _BESIDE = 40
 """The largest number of shifts that are tried, beginning with the smallest shift. A shift moves one object onto another
 partner. A larger number looks farther around, and takes longer."""
 _MOST = 20_000
-"""The number of tried shifts times the number of objects in map a is at most this large. So few shifts are tried in large
-maps. There it hardly ever happens that all rows of objects match their neighbours. A larger number takes longer."""
+"""The largest product of the number of tried shifts and the number of objects in map a. So few shifts are tried in large
+maps. In a large map, it hardly ever happens that all rows of objects match their neighbours. A larger number takes
+longer."""
 _SIZES = (0.0, -1.0, 1.0, -2.0, 2.0)
 """The sizes at which a search starts, in standard deviations of the size of one map relative to the other. A true size
 between them is at most half a standard deviation from the nearest one, and the wide gates of the first round allow for this.
 More sizes take longer."""
 _WIDE = 0.5
-"""The gates of the first round are wider by this share of the standard deviations of tilt and size. 0.5 is half the step of
-`_SIZES`. A larger value lets more wrong partners in."""
+"""The share of the standard deviations of tilt and size by which the gates of the first round are wider. 0.5 is half the
+step of `_SIZES`. A larger value lets more wrong partners in."""
 _ROUNDS = 4
 """The number of rounds of matching and fitting. A larger number takes longer."""
 _TIGHT = 1e-6

@@ -13,7 +13,8 @@ _DETERMINED = 1e12
 """The largest condition number of the information of a transform that its matches determine. A larger number accepts less
 certain transforms."""
 _DENSITY_NEIGHBOURS = 8
-"""The number of nearest objects from which the local density of objects is computed. A larger number smooths it more."""
+"""The number of nearest objects from which the local density of objects is computed. A larger number smooths the density
+more."""
 _ALIKE_NEIGHBOURS = 4
 """The number of nearest objects from which the local density of objects of one label is computed. A smaller number finds the
 density of smaller groups of equal objects, so matches in groups give less evidence. With 4, false alarms in simulated places
@@ -52,7 +53,7 @@ class Problem:
         H hypotheses each move P objects. limits: L limits of the squared Mahalanobis distance of a match. The local density
         of objects with the label is the larger one of two: the density of all objects times the share of the label, and the
         density of this label alone. Equal objects often stand in groups, such as chairs at a table. If one of them has a
-        match by chance, others of its group have too.
+        match by chance, others of its group also have one.
         """
         label = self.a.label[index]
         everything, alike = moved[..., :2], np.concatenate([moved[..., :2], label[..., None] * self.apart], axis=-1)
@@ -107,8 +108,8 @@ def jacobian_of(x: Floats, moved: Floats) -> Floats:
 def gate(problem: Problem, index: Ints, x: Floats, hessian: Floats) -> tuple[Ints, Floats, Floats, Floats, Bools]:
     """Match objects `index` (H, P) of map a to the nearest objects of map b, under transforms x (H, 4).
 
-    Return these partners (H, P), the offsets, covariances and Jacobians, and which match. hessian: (H, 4, 4) the information
-    of the transforms, NaN before the first fit. Its inverse widens the gates.
+    Return these partners (H, P), the offsets, covariances and Jacobians, and which pairs match (H, P). hessian: (H, 4, 4)
+    the information of the transforms, NaN before the first fit. Its inverse widens the gates.
     """
     moved = move(x, problem.a.position[index])
     partner = problem.nearest(moved, index)
@@ -158,9 +159,9 @@ def _weights(miss: Floats, information: Array) -> Floats:
 def transform_covariance(problem: Problem, x: Floats, a: Ints, b: Ints) -> Floats:
     """Return the covariance (4, 4) of a transform x (4,) that was fitted to the pairs of objects a (P,) and b (P,).
 
-    The shared errors of both maps move the fit. `shapes` derives by how much. So the covariance contains the shared shift
-    and yaw in full, however many pairs there are. It also contains the effect of the shared tilt and size on this fit. NaN
-    if the pairs do not determine the transform.
+    The shared errors of both maps move the fit. The module `shapes` derives how far. So the covariance contains the shared
+    shift and yaw in full, however many pairs there are. It also contains the effect of the shared tilt and size on this fit.
+    It is NaN if the pairs do not determine the transform.
     """
     moved = move(x[None], problem.a.position[a][None])
     offset = covariances(problem, x[None], a[None], b[None])[0]

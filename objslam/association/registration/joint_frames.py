@@ -2,12 +2,12 @@
 
 Each map measures its objects in a frame of its own. A frame has x, y, z and yaw, because z is up in all maps. The first
 frame is the frame of the result. All objects of a map share an error: a shift, a turn and a wrong size
-(`core.maps.shared_covariance`). It is a variable too, with its covariance as the prior. So a map whose size is uncertain
-takes the size of a map whose size is known. The time of a Gauss-Newton step grows with the number of measurements, and with
-the cube of the number of objects or of maps, whichever is smaller (`ArrowSystem`). Cauchy's weights limit the effect of
-moved objects.
+(`core.maps.shared_covariance`). The shared error is also a variable, and its covariance is the prior. So a map whose size is
+uncertain takes the size of a map whose size is known. The time of a Gauss-Newton step grows with the number of measurements,
+and with the cube of the number of objects or of maps, whichever is smaller (`ArrowSystem`). Cauchy's weights limit the
+effect of moved objects.
 
-The errors that are not shared may be larger than the covariances say: objects are nudged, and their boxes differ from day to
+The errors that are not shared may be larger than the covariances say. Objects are nudged, and their boxes differ from day to
 day. The residuals show this. With at least three maps, the variance of each map is estimated against all others (variance
 components; Helmert 1907, Foerstner 1979). Two maps have one common variance.
 """
@@ -28,12 +28,12 @@ _STEPS = 30
 _ROUNDS = 10
 """The most estimates of the maps' noise, each followed by a solve. More are slower, and hardly change the noise."""
 _SAME_NOISE = 0.02
-"""The noise is not estimated again if its relative change is smaller than this. A larger value ends sooner."""
+"""The least relative change of the noise after which the noise is estimated again. A larger value ends sooner."""
 _FEWEST_MAPS = 3
-"""With at least this number of maps, each map has a noise of its own. With fewer, all have one noise, because the residuals
-of two maps do not show which map is worse. A larger number gives more maps one noise."""
+"""The least number of maps with which each map has a noise of its own. With fewer maps, all maps have one noise, because the
+residuals of two maps do not show which map is worse. With a larger number, one noise is used for more maps."""
 _POOLED = 10.0
-"""A map's given covariances weigh as much as this number of residuals. A larger number trusts the covariances more. At 10, a
+"""The weight of a map's given covariances, as a number of residuals. A larger number trusts the covariances more. At 10, a
 map of a few objects keeps its covariances, and a map of a few dozen is judged by its residuals."""
 _AGAIN = 0.01
 """The standard deviation (m) that is added to each measured position, as an error that is not shared. Without it, one pair
@@ -66,10 +66,11 @@ class Measured:
 class JointFrames:
     """S frames and N objects in the frame of the first map.
 
-    site_T_map: (S, 4, 4). frame_covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each, 0 for the first. positions:
-    (N, 3) m. covariance: (N, 3, 3) m^2. own: (N, 3, 3) m^2, the part of the covariance from errors that an object has alone.
-    correlated: (N, 3, m) m, the rest, as a factor of the joint covariance. weight: (R,) the weight of each measurement, in
-    [0, 1]. noise: (S,) the factor, at least 1, on the covariances of the errors that are not shared. 1 for one map alone.
+    site_T_map: (S, 4, 4) the poses of the frames. frame_covariance: (S, 4, 4) the covariance of x, y, z (m) and yaw (rad) of
+    each frame, 0 for the first frame. positions, covariance: (N, 3) m and (N, 3, 3) m^2 of the objects. own: (N, 3, 3) m^2,
+    the part of the covariance from errors that an object has alone. correlated: (N, 3, m) m, the rest, as a factor of the
+    joint covariance. weight: (R,) the weight of each measurement, in [0, 1]. noise: (S,) the factor, at least 1, on the
+    covariances of the errors that are not shared. It is 1 for one map alone.
     """
 
     site_T_map: Floats
@@ -86,8 +87,8 @@ class JointFrames:
 class _State:
     """A solve of S maps.
 
-    errors: (S, 7) the shared errors, in units of their roots. taken: (S,) how many coordinates of the residuals the frame
-    and the shared error of each map take.
+    errors: (S, 7) the shared errors, in units of their roots. taken: (S,) the degrees of freedom that the frame and the
+    shared error of each map take from its residuals.
     """
 
     found: JointFrames
@@ -164,7 +165,7 @@ def _solve(measured: Measured, site_T_map: Floats, count: int, noise: Floats, er
         if np.abs(step).max(initial=0.0) < _STILL:
             break
         weight = np.where(alone, 1.0, 1 / (1 + np.einsum("ri,rij,rj->r", miss, plain, miss) / HALF_RAY))
-    # Normal residuals have weights below 1 too. Without a division by their mean, the covariances would be too large.
+    # Normal residuals also have weights below 1. Without a division by their mean, the covariances would be too large.
     information = information / _mean_weight(information, total, measured.object)[:, None, None]
     total = _sums(information, measured.object, count)
     system, _ = _linearised(measured, lever, information, total, miss, errors)
@@ -182,8 +183,8 @@ def _solve(measured: Measured, site_T_map: Floats, count: int, noise: Floats, er
 
 
 def _mean_weight(information: Floats, total: Floats, object_: Ints) -> Floats:
-    """Return the mean weight (R,) that normal residuals would have. information: (R, 3, 3) of the measurements. total:
-    (N, 3, 3), its sum for each object."""
+    """Return the mean weight (R,) that normal residuals would have. information: (R, 3, 3) of the measurements. total: (N,
+    3, 3), the sum of the information about each object."""
     share = np.trace(information @ np.linalg.inv(total)[object_], axis1=1, axis2=2)
     left = np.clip(1 - share / 3, 0.0, 1.0)[:, None] * _SQUARES  # The fit of the position makes residuals smaller.
     return np.asarray((1 / (1 + left / HALF_RAY)).mean(axis=1))

@@ -35,17 +35,17 @@ MIN_LOG_ODDS = 9.2
 """The least log odds against chance of an accepted registration, and the least lead over another place. A larger value
 refuses more registrations. 9.2 allows one false alarm in 10,000 pairs of maps."""
 _STAGES = ((32, 200), (100, 60), (1 << 30, 20))
-"""The stages of the fit, two numbers each. A proposal is fitted to the first number of objects. The objects nearest to its
-pair are taken. The second number is how many of the best proposals are fitted. Larger numbers find smaller overlaps and take
-longer."""
+"""The stages of the fit, with two numbers each. The first number is how many objects a proposal is fitted to. They are the
+objects nearest to its pair. The second number is how many of the best proposals are fitted. Larger numbers find smaller
+overlaps and take longer."""
 _LIMITS = (SAME_POINT, SAME_POINT / 2)
-"""The largest squared Mahalanobis distances of a match, one for each count of matches. The best count is the evidence. The
-first holds 99 % of true matches, the second 87 %. With tighter limits, simulated groups of three equal objects gave false
-alarms more often than the log odds say."""
+"""The largest squared Mahalanobis distances of a match. Matches are counted once with each limit, and the count with the
+most evidence is used. The first limit holds 99 % of true matches, the second 87 %. With tighter limits, simulated groups of
+three equal objects gave false alarms more often than the log odds say."""
 _FITS = 2
 """The number of rounds of matching and fitting in each stage. A larger number takes longer."""
 _SAME_SHIFT, _SAME_TURN = 0.5, 0.1
-"""Two transforms count as the same if they differ by less than this shift (m, at the centre of the map) and this turn (rad).
+"""The largest difference of two transforms that count as the same: a shift (m, at the centre of the map) and a turn (rad).
 Larger values hide repetitions."""
 
 
@@ -54,9 +54,9 @@ class Registration:
     """The transform between the frames of two maps.
 
     b_T_a: (4, 4) takes points from the frame of map a to the frame of b. It turns about z only. NaN if no transform fits.
-    covariance: (4, 4) of the x, y, z (m) and yaw (rad) of b_T_a. matches: (P, 2) indices of one object in a and in b.
-    log_odds: evidence against chance, -ln of the expected number of false alarms. second_b_T_a, second_log_odds: transform
-    and log odds of the second-best place, None and -inf if there is none.
+    covariance: (4, 4) the covariance of x, y, z (m) and yaw (rad) of b_T_a. matches: (P, 2) indices of one object in a and
+    in b. log_odds: evidence against chance, -ln of the expected number of false alarms. second_b_T_a, second_log_odds:
+    transform and log odds of the second-best place, None and -inf if only one place fits.
     """
 
     b_T_a: Floats
@@ -73,7 +73,7 @@ class Registration:
 
     @property
     def verdict(self) -> Verdict:
-        """The transform is accepted if both the log odds and the lead are at least `MIN_LOG_ODDS`."""
+        """The verdict on the transform. It is accepted if the log odds and the lead are both at least `MIN_LOG_ODDS`."""
         if self.log_odds < MIN_LOG_ODDS:
             return "too little evidence"
         return "accepted" if self.lead >= MIN_LOG_ODDS else "ambiguous"

@@ -37,7 +37,8 @@ def placed(objects: ObjectMap) -> list[int]:
 
 
 def reason(found: Registration, a: ObjectMap, b: ObjectMap, names: tuple[str, str]) -> str:
-    """Return in a few words why the registration of a to b was accepted or refused. names: of a and b, for this text."""
+    """Return in a few words why the registration of a to b was accepted or refused. names: the names of a and b in this
+    text."""
     for name, objects in zip(names, (a, b), strict=True):
         if (number := len(placed(objects))) < 2:
             return f"too little evidence, because {name} has {number or 'no'} resolved object"

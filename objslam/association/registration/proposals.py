@@ -8,10 +8,10 @@ from objslam.association.registration.shapes import Shape, Vectors
 from objslam.core.arrays import Array, Floats, Ints
 
 _PAIRS = 6000
-"""The most pairs of objects of one map that propose transforms. Each order of a pair counts. A larger number finds smaller
-overlaps and takes longer. Chosen for time, not by a sweep."""
+"""The most pairs of objects of one map that propose transforms. The two orders of a pair count as two pairs. A larger number
+finds smaller overlaps and takes longer. The number was chosen for time, not by a sweep."""
 _MIN_PARTNERS = 6
-"""Each object is in pairs with at least this number of others, even beyond `_PAIRS`. A larger number takes longer."""
+"""The least number of other objects with which each object is paired, even beyond `_PAIRS`. A larger number takes longer."""
 _MIN_BASE = 6.0
 """The least distance between the two objects of a pair, in standard deviations of their difference. A larger value gives
 better headings and fewer pairs. At 6, the heading of a pair has a standard deviation below 1/6 rad in each map."""
@@ -81,8 +81,9 @@ def propose(problem: Problem) -> tuple[Ints, Floats, int]:
 def _reach(a: Vectors, b: Vectors, size_variance: float) -> Floats:
     """Return by how much (m) the lengths of similar vectors in map b may differ from the lengths (P,) of vectors in map a.
 
-    It is at least `_GATE` standard deviations. size_variance: the variance of the logarithm of the size of map b. The error
-    of a length in b grows with this length. The length in b is not known yet, but it is hardly more than the length in a.
+    This difference is at least `_GATE` standard deviations. size_variance: the variance of the logarithm of the size of map
+    b. The error of a length in b grows with this length. The length in b is not known yet, but it is hardly more than the
+    length in a.
     """
     other = (b.length_variance - size_variance * b.length**2).max(initial=0.0)
     reach = np.zeros_like(a.length)
@@ -94,8 +95,8 @@ def _reach(a: Vectors, b: Vectors, size_variance: float) -> Floats:
 def _support(problem: Problem, i: Ints, k: Ints, yaw: Floats, turn_variance: Floats) -> Floats:
     """Return the number (H,) of neighbours that coincide when an object of map a is laid on an object of map b.
 
-    i: (H,) the object of the map a. k: (H,) the object of the map b. Only neighbours with the same label count.
-    yaw, turn_variance: (H,) rad and rad^2, the heading of each proposal and its variance.
+    i, k: (H,) the objects of map a and of map b. Only neighbours with the same label count. yaw, turn_variance: (H,) rad and
+    rad^2, the heading of each proposal and its variance.
     """
     (near_a, offset_a), (near_b, offset_b) = (_offsets(m) for m in (problem.a, problem.b))
     support = np.zeros(len(i))

@@ -1,5 +1,5 @@
-"""The shape of a map: where its objects lie relative to each other, and which of their errors a transform of the map can
-absorb.
+"""The shape of a map: where its objects lie relative to each other, and which errors of the objects a transform of the map
+can absorb.
 
 The error of object i is L_i e + o_i. The object has o_i alone. All objects of the map share e, which has seven numbers: a
 shift, a rotation and a size (`core.maps.shared_covariance`). The transform x between two maps is a shift and a yaw. So e has
@@ -86,8 +86,8 @@ class Shape:
 class Vectors:
     """P vectors between objects of one map.
 
-    base: (P, 3) m, the vectors. length: (P,) m, of their horizontal part. length_variance, rise_variance: (P,) m^2, of this
-    length and of the vertical part.
+    base: (P, 3) m, the vectors. length: (P,) m, the length of their horizontal part. length_variance, rise_variance: (P,)
+    m^2, the variances of this length and of the vertical part.
     """
 
     base: Floats
@@ -100,7 +100,7 @@ def shape_of(whole: Constellation, keep: Ints, shared: Floats | None) -> Shape:
     """Return the shape of the objects `keep` (N,) of a map.
 
     shared: (7, 7) the covariance of the shared error, in the frame of the map. The covariances of `whole` contain this
-    error. None if it is not known. The standard deviation `_FLOOR` is added to each own error.
+    error. `shared` is None if it is not known. The standard deviation `_FLOOR` is added to each own error.
     """
     centre = whole.position[keep].mean(axis=0)
     back = np.eye(4)
