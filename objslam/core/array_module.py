@@ -23,21 +23,21 @@ Tensor = Any
 """A numpy array or a torch tensor."""
 
 Backend = Literal["numpy", "cpu", "cuda"]
-"""The library numpy, or the device of torch. "cpu" is torch without a card."""
+"""What computes a batch: numpy, torch on the CPU ("cpu"), or torch on a CUDA device ("cuda")."""
 
 
 def chosen_backend(device: str, large: bool) -> Backend:
     """Choose numpy or torch on CUDA for a batch. device: the setting `triangulation.device`.
 
     With "auto", a `large` batch runs on CUDA if torch sees a CUDA device. Any other batch, and every one with "cpu", runs in
-    numpy. torch on a CPU is no choice: from 50,000 to 1,000,000 rays, it took 1.2 to 2.6 times the CPU time of numpy. The
-    tests run in it what CUDA would run.
+    numpy. torch on a CPU is never chosen. For 50,000 to 1,000,000 rays, it took 1.2 to 2.6 times the CPU time of numpy. Only
+    tests use it, to run the code for CUDA.
 
     Raises:
         ConfigError: the setting is "cuda", and torch is not installed or sees no CUDA device.
     """
     if device == "cpu" or (device == "auto" and not large):
-        return "numpy"  # Most batches. To look for torch takes as long as some of them.
+        return "numpy"  # Most batches. Some take no longer than the search for torch.
     installed = find_spec("torch") is not None
     if device == "cuda" and not installed:
         raise ConfigError("triangulation.device=cuda needs torch", hint='pip install "objslam[torch]"')
@@ -53,7 +53,7 @@ def chosen_backend(device: str, large: bool) -> Backend:
 
 
 def _has_driver() -> bool:
-    """Return whether the driver of CUDA can be loaded. Without it, torch (1.4 s) need not be imported."""
+    """Return whether the driver of CUDA can be loaded. Without the driver, the import of torch (1.4 s) is left out."""
     try:
         ctypes.CDLL("libcuda.so.1")
     except OSError:
@@ -136,7 +136,8 @@ def take_along(array: Tensor, index: Tensor, axis: int) -> Tensor:
 
 
 def contiguous(array: Tensor) -> Tensor:
-    """Return an array whose elements are contiguous in memory, in the order of its axes. It is a copy if needed."""
+    """Return an array whose elements are contiguous in memory, in the order of its axes. The array is copied only if
+    needed."""
     return np.ascontiguousarray(array) if isinstance(array, np.ndarray) else array.contiguous()
 
 

@@ -12,21 +12,21 @@ from objslam.core.noise import NoiseFactors
 from objslam.core.types import Keyframes, Rays
 
 OBSERVABLE = 0.8
-"""A parameter is observable if its standard deviation is at most this share of the standard deviation of its prior. At 0.8,
-the log gives about half as much information as the prior. A larger share calls more parameters observable."""
+"""The largest standard deviation of an observable parameter, as a share of the standard deviation of its prior. At 0.8, the
+log gives about half as much information as the prior. A larger share calls more parameters observable."""
 TRADED_OFF = 0.9
-"""Two parameters trade off if their absolute correlation is above this value: the log hardly tells them apart. With a larger
+"""The absolute correlation above which two parameters trade off. The log hardly tells such parameters apart. With a larger
 value, fewer pairs trade off."""
 
 SCALES = ("scale", "lateral_scale", "turn_scale", "range_scale", "tag_scale", "focal")
-"""The kinds of parameters that are shares: the correction multiplies a measurement by 1 + the share."""
+"""The kinds of parameters that are shares. The correction multiplies a measurement by 1 + the share."""
 AXES = ("roll", "tilt", "yaw")
 """The rotations of a camera on the robot, about the axes x, y and z of base."""
 LENS = ("focal", "cx", "cy")
 """The errors of a camera matrix. The focal length is too short by the share `focal`. The image centre is too far left by cx
 and too far up by cy, both as shares of the focal length."""
 OF_PLACES = ("tag_scale", "surface")
-"""The parameters of a place, not of a robot. The calibration of a robot has none of them."""
+"""The kinds of parameters that belong to a place, not to a robot. The calibration of a robot has none of them."""
 MOST_SCALE = 0.5
 """The largest absolute value of a share. A larger bound lets a solve shrink lengths towards zero. An error of more than half
 means a wrong unit, and a calibration should not hide that."""
@@ -56,10 +56,11 @@ def kind(name: str) -> str:
 class Calibration:
     """The estimate of the shared errors. Measurements that are corrected by these values agree best.
 
-    names: P names, such as `odometry.scale` or `CAMERA.clock`. values: (P,) in the unit of each. covariance: (P, P). prior:
-    (P,) standard deviations before the solve. prior_mean: (P,) values expected before the solve, None if all are 0.
-    prior_covariance: (P, P) before the solve, None if the parameters were independent. prior_factor: (P,) the factors by
-    which the covariance treats priors as wider, because the values are far from them. None if no prior is widened.
+    names: P names, such as `odometry.scale` or `CAMERA.clock`. values: (P,) in the unit of each. covariance: (P, P) after
+    the solve. prior: (P,) standard deviations before the solve. prior_mean: (P,) values expected before the solve, None if
+    all are 0. prior_covariance: (P, P) before the solve, None if the parameters were independent. prior_factor: (P,) the
+    factors by which the priors were widened for `covariance`, because the values are far from the priors. None if no prior
+    was widened.
     """
 
     names: tuple[str, ...]
@@ -113,8 +114,8 @@ class Calibration:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the entries of summary.json: each parameter with value, sigma, prior, unit and whether it is observable,
-        the pairs that trade off, and the covariance before and after the solve.
+        """Return the entries of summary.json. They are the parameters, the pairs that trade off, and the covariance before
+        and after the solve. A parameter has its value, sigma, prior and unit, and whether it is observable.
 
         A later run with this file in `calibration.file` takes the values and the covariance as its prior.
         """
@@ -141,7 +142,7 @@ class Calibration:
 
 
 def combine(calibrations: Sequence[Calibration]) -> Calibration:
-    """Combine calibrations of one robot from several logs: their information adds up, and the prior counts once.
+    """Combine calibrations of one robot from several logs. Their information adds up, and the prior counts once.
 
     A parameter that only some logs have is estimated from these logs. Its prior is from the first log that has it,
     conditional on the parameters that this log shares with earlier logs.
@@ -175,7 +176,7 @@ class CalibratedMeasurements(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The P parameters."""
+        """The names of the P parameters."""
 
     @property
     def settings(self) -> Settings:
@@ -231,8 +232,8 @@ class CalibratedMeasurements(Protocol):
         """Return the same errors for other keyframes and rays of the log."""
 
     def with_rays(self, directions: Floats, ranges: Floats, values: Floats) -> Self:
-        """Return the same measurements with other directions (R, 3), unit, and ranges (R,), m, of the rays that `at` returns
-        at values (P,)."""
+        """Return the same measurements with other rays. At values (P,), `at` then returns these unit directions (R, 3) and
+        ranges (R,), m."""
 
     def with_noise(self, noise: NoiseFactors) -> Self:
         """Return the same measurements with other noise."""
@@ -258,5 +259,5 @@ class CalibratedMeasurements(Protocol):
 
 
 def expected_errors(errors: CalibratedMeasurements) -> Calibration:
-    """Return the errors as their prior expects them before a solve."""
+    """Return the shared errors with the values and the covariance that they have before a solve."""
     return Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))

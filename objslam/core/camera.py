@@ -21,15 +21,15 @@ COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {
 }
 """The numbers of distortion coefficients that each model accepts."""
 
-_STEPS, _FINER = 2000, 4  # The angles in the grid that finds the fold of a lens, and the refinements. More are more exact.
-_ALONG = 200  # The number of pieces of an image side in the sum for the solid angle. More are more exact and slower.
+_STEPS, _FINER = 2000, 4  # Angles of a grid and number of grids in the search for a lens's fold. More are more exact.
+_ALONG = 200  # The number of pieces of an image side in the sum for the solid angle. More are slower and more exact.
 _LEAST = 1e-9  # The least solid angle of a camera, sr. It keeps a division by the solid angle finite.
 _TURNS, _EXACT, _FLAT = 60, 1e-14, 1e-12  # The most Newton iterations, the step to stop at (rad) and the least divisor.
 
 
 @dataclass(frozen=True)
 class RangeNoise:
-    """The noise of the depths of one sensor.
+    """The noise of the depths of one sensor, as standard deviations.
 
     sigma: m, the constant part. sigma_per_m: the part that grows with the distance, m per m. bias: m, the part that all
     ranges of one object share.
@@ -46,7 +46,8 @@ class Camera:
 
     matrix: (3, 3) px. distortion: (D,) coefficients. base_T_camera: (4, 4) the pose of the optical frame in base.
     depth_scale: the units of a depth image per metre. sees_size: whether the boxes show how large the objects are. A box
-    that only marks a bearing does not. depth_noise: the noise of its depths, None for the noise in the settings `depth`.
+    that only marks a bearing does not. depth_noise: the noise of the camera's depths, None for the noise in the settings
+    `depth`.
     """
 
     name: str
@@ -147,7 +148,7 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
         pixels = pixels if finite.all() else np.where(finite[:, None], pixels, 0.0)
         straight = pixels @ camera.inverse_matrix[:, :2].T + camera.inverse_matrix[:, 2]
         return straight / lengths(straight)[:, None], finite
-    import cv2  # Its import takes 0.02 s, and the boxes of many logs are undistorted.
+    import cv2  # Deferred: the import takes 0.02 s, and many logs have undistorted boxes.
 
     points = np.ascontiguousarray(pixels, dtype=np.float64)[:, None, :]
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
@@ -303,9 +304,10 @@ def _growth(camera: Camera, angle: Floats) -> Floats:
 
 
 def box_sizes(box: Floats, direction: Floats, cameras: Sequence[Camera], camera: Ints) -> Floats:
-    """Return width and height (R, 2) of the objects in boxes (R, 4), px, in m per m of their distances.
+    """Return the width and height (R, 2) of the object in each box (R, 4), px, in m per m of the object's distance.
 
-    direction: (R, 3) unit vectors through the centres of the boxes, in the camera frame. camera: (R,) number of its camera.
+    direction: (R, 3) unit vectors through the centres of the boxes, in the camera frame. camera: (R,) the index of each
+    box's camera in `cameras`.
     """
     focal = np.array([[c.matrix[0, 0], c.matrix[1, 1]] for c in cameras])[camera]
     pinhole = np.array([not c.fisheye for c in cameras])[camera]
@@ -315,7 +317,7 @@ def box_sizes(box: Floats, direction: Floats, cameras: Sequence[Camera], camera:
 
 
 def _edge(low: float, right: float, bottom: float, pieces: int) -> Floats:
-    """Return pixels (4 * pieces, 2) around the rectangle from corner (low, low) to (right, bottom), (low, low) first."""
+    """Return pixels (4 * pieces, 2) around the rectangle from corner (low, low) to (right, bottom)."""
     along = np.linspace(0.0, 1.0, pieces, endpoint=False)[:, None]
     corners = np.array([[low, low], [right, low], [right, bottom], [low, bottom]])
     return np.concatenate([a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])

@@ -20,18 +20,19 @@ class Estimate:
     solved: (N,) whether the object was part of the graph. seen_sigma: (N,) m, the standard deviation of the object's
     position along its least certain axis, relative to a camera that saw it. It leaves out the drift of the path. NaN for an
     object that was not solved. weight: (R,) robust weight of each ray in [0, 1]. A ray that is rejected or has no object
-    weighs 0. cost_before: error of the graph at the start of the first solve. cost_after: error of the graph at the optimum
-    of the last solve. For Eq. 1 the error is the sum of distances, m. calibration: the shared errors that were estimated, or
-    None. The poses fit measurements that are corrected by them. noise: the estimated noise, None if none was estimated.
-    box_offset: the standard deviation of the error that all box centres of an object share, divided by the object's size.
-    None if boxes have no size. correlated: (N, 3, m) m, the part of the errors that is correlated between objects, as a
-    factor of their joint covariance. It is 0 for an object that was not solved, and None if all objects are independent.
-    tags: the rotation and the size of each fiducial that has them, by the index of its object. log_evidence: the log
-    evidence of the association, up to a constant. It compares associations of the same rays. -inf if it is not known.
-    uncalibrated: whether the estimation of the shared errors failed. Then the covariances lack these errors.
-    error_covariance: (N, 3, 3) m^2, the part of the covariance that was added by `with_errors`, None if nothing was added.
-    moved_by_held: (N, 3, H) m, how far usual errors that the solve held may move the objects, as a factor of their joint
-    covariance. None if it was not computed. The covariance does not contain it yet.
+    weighs 0. cost_before: the error of the graph at the start of the first solve. cost_after: the error of the graph at the
+    optimum of the last solve. For a solve by Eq. 1 (`triangulation.point_to_lines`), the error is the sum of the distances
+    between rays and objects, m. calibration: the shared errors that were estimated, or None. The poses fit measurements that
+    are corrected by these errors. noise: the estimated noise, None if none was estimated. box_offset: the standard deviation
+    of the error that all box centres of an object share, divided by the object's size. None if boxes have no size.
+    correlated: (N, 3, m) m, the part of the errors that is correlated between objects, as a factor of their joint
+    covariance. It is 0 for an object that was not solved, and None if all objects are independent. tags: the rotation and
+    the size of each fiducial that has them, by the index of its object. log_evidence: the log evidence of the association,
+    up to a constant. It compares associations of the same rays. It is -inf if it is unknown. uncalibrated: whether the
+    estimation of the shared errors failed. Then the covariances lack these errors. error_covariance: (N, 3, 3) m^2, the part
+    of the covariance that was added by `with_errors`, None if nothing was added. moved_by_held: (N, 3, H) m, how far shared
+    errors of the usual size may move the objects if the solve held these errors fixed. It is a factor of the objects' joint
+    covariance. None if it was not computed. `covariance` does not contain it yet.
     """
 
     map_T_base: Floats
@@ -60,9 +61,9 @@ class Estimate:
         return replace(self, covariance=self.covariance + more, error_covariance=before + more)
 
     def of_objects(self, kept: Bools, rays: Bools) -> Self:
-        """Return the estimate of some of its objects (N,) at the same poses.
+        """Return the estimate with only the objects of a mask `kept` (N,), at the same poses.
 
-        The rays that are not among `rays` (R,) weigh 0.
+        rays: (R,) a mask. Rays outside of the mask weigh 0.
         """
         number = np.cumsum(kept) - 1
         return replace(

@@ -21,14 +21,14 @@ from objslam.core.rotation import (
 )
 
 _SMALL = 1e-4
-"""A series replaces the coefficients of a twist if its angle, rad, is smaller than this. A larger value makes the series
-less exact. At this value, its relative error is below 1e-17."""
+"""The angle (rad) of a twist below which a series replaces its coefficients. A larger value makes the series less exact. At
+this value, its relative error is below 1e-17."""
 _ON_A_LINE = 1e-9
-"""Points lie on a line if the second singular value of their cross-covariance is at most this share of the first. A larger
-share treats more point sets as lines. Rounding leaves about 1e-15."""
+"""The largest second singular value of the cross-covariance of points on a line, as a share of the first one. A larger share
+treats more point sets as lines. Rounding leaves about 1e-15."""
 _FEW_POINTS = 100
-"""Up to this number of points, all distances between them are computed. For more points, a search tree takes less time. Few
-points need no tree, and so no import of scipy.spatial, which takes 0.07 s."""
+"""The most points between which all distances are computed. For more points, a search tree takes less time. Few points need
+no tree, and so no import of scipy.spatial, which takes 0.07 s."""
 
 
 def make_pose(rotation: Floats, translation: Floats) -> Floats:
@@ -84,8 +84,8 @@ def split_se2(pose: Floats) -> tuple[Floats, Floats]:
 
 
 def is_planar(poses: Floats) -> bool:
-    """Return whether all poses (N, 4, 4) have one height, roll and pitch, as on an SE(2) path with a constant offset. They
-    may differ by 1e-6, m or rad."""
+    """Return whether all poses (N, 4, 4) have one height, roll and pitch, as on an SE(2) path with a constant offset.
+    Heights (m) and axes may differ by 1e-6."""
     if len(poses) == 0:
         return True
     x_axis, y_axis = poses[:, 0, :3], poses[:, 1, :3]  # The axes of the map, in the frame of each pose.
@@ -96,7 +96,7 @@ def is_planar(poses: Floats) -> bool:
 
 
 def log_se3(pose: Floats) -> Floats:
-    """Return the logarithm (N, 6) of poses (N, 4, 4), the twist whose exponential is the pose."""
+    """Return the logarithms (N, 6) of poses (N, 4, 4). The exponential of such a twist is the pose."""
     omega = rotation_vector(pose[..., :3, :3])
     squared, small, divisor = _squares(omega)
     half = np.sqrt(divisor) / 2
@@ -169,7 +169,7 @@ def exp_se3(twist: Floats) -> Floats:
 
 def _squares(omega: Floats) -> tuple[Floats, Bools, Floats]:
     """Return for rotation vectors (..., 3) three arrays (...): the squares of the angles, whether each angle is so small
-    that a series is needed, and the squares as divisors, in which 1 replaces those of small angles."""
+    that a series is needed, and the squares as divisors, in which 1 replaces the squares of small angles."""
     squared = np.einsum("...i,...i->...", omega, omega)
     small = squared < _SMALL**2
     return squared, small, np.where(small, 1.0, squared)
@@ -307,7 +307,8 @@ def _best_rotation(a: Floats, b: Floats) -> tuple[Floats, float]:
 def widest_angle(directions: Floats) -> float:
     """Return the widest angle (rad) between any two lines with unit directions (N, 3).
 
-    Two opposite directions have the angle 0. Of more than 400 lines, only the extremes along the main axes are compared.
+    Two opposite directions have the angle 0. If there are more than 400 lines, only the extremes along the main axes are
+    compared.
     """
     if len(directions) < 2:
         return 0.0
@@ -319,7 +320,7 @@ def widest_angle(directions: Floats) -> float:
 
 
 def angles_off(origins: Floats, directions: Floats, points: Floats) -> Floats:
-    """Return the angles (...), rad in [0, pi], between unit directions (..., 3) and points (..., 3), seen from origins
+    """Return the angles (...), rad in [0, pi], by which unit directions (..., 3) from origins (..., 3) miss points
     (..., 3)."""
     to = points - origins
     return np.arctan2(lengths(cross(to, directions)), np.einsum("...i,...i->...", to, directions))

@@ -25,12 +25,13 @@ class LabelNoise(NamedTuple):
 class NoiseFactors:
     """Factors on the standard deviations of the settings, and the shrinkage that this noise causes.
 
-    rays: `rays.pixel_sigma` and `rays.box_sigma`. ranges: `depth.sigma` and `depth.sigma_per_m`. range_bias: `depth.bias`.
-    along: `odometry.x_per_m` and `odometry.xy_per_rad`. across: `odometry.y_per_m` and `odometry.floor_xy`. turning: the
-    odometry's noise of the heading. heading: `localization.yaw`. place: `localization.xy`. shrinkage: the share by which a
-    joint solve makes all lengths too short. The other four describe lasting errors (`Lasting`) of localised headings and
-    places. heading_share, place_share: the share of the variance that lasts. heading_seconds, place_seconds: how long it
-    lasts, s. by_label: the noise of the ranges of some labels, instead of `ranges` and `range_bias`.
+    The first eight fields are factors on these settings. rays: `rays.pixel_sigma` and `rays.box_sigma`. ranges:
+    `depth.sigma` and `depth.sigma_per_m`. range_bias: `depth.bias`. along: `odometry.x_per_m` and `odometry.xy_per_rad`.
+    across: `odometry.y_per_m` and `odometry.floor_xy`. turning: the odometry's noise of the heading. heading:
+    `localization.yaw`. place: `localization.xy`. shrinkage: the share by which a joint solve makes all lengths too short.
+    Four fields describe lasting errors (`Lasting`) of localised headings and places. heading_share, place_share: the share
+    of the variance that lasts. heading_seconds, place_seconds: how long this part lasts, s. by_label: the noise of the
+    ranges of some labels. It replaces `ranges` and `range_bias` for these labels.
     """
 
     rays: float = 1.0
@@ -127,8 +128,9 @@ MOST_NOISE = 20.0
 Real robots have up to 6.3, for odometry that is only the commanded speed."""
 
 MOST_POSE_NOISE = 300.0
-"""The largest estimated factor on `localization.xy` and `localization.yaw`. With the defaults of these settings, it allows 6
-m, such as a GPS between houses has, and any heading. With a larger factor, wrong units of a path are taken for noise."""
+"""The largest estimated factor on `localization.xy` and `localization.yaw`. With the default settings, it allows errors of 6
+m, as of a GPS between houses, and any error of the heading. With a larger factor, wrong units of a path are taken for
+noise."""
 
 NOMINAL = NoiseFactors()
 """The noise in the settings, unchanged."""
@@ -139,8 +141,8 @@ def range_noise(
 ) -> tuple[Floats, Floats]:
     """Return the standard deviations (n,), m, of ranges (n,), m, and of the bias that all ranges of an object share.
 
-    half: (n,) half the width of each thing, in m per m of its distance (`surface_ranges.half_widths`). camera: (n,) the
-    index of each range's camera. A camera without `depth_noise` has the noise in the settings.
+    half: (n,) half the width of each thing, in m per m of the thing's distance (`surface_ranges.half_widths`). camera: (n,)
+    the index of each range's camera. A camera without `depth_noise` has the noise in the settings.
     """
     of = settings.depth
     told = [(of.sigma, of.sigma_per_m, of.bias) if c.depth_noise is None else astuple(c.depth_noise) for c in cameras]

@@ -21,8 +21,8 @@ from objslam.core.statistics import SAME_POINT
 Status = Literal["ok", "unresolved"]
 Fate = Literal["confirmed", "moved", "gone", "new", "unconfirmed"]
 FATES: tuple[Fate, ...] = ("confirmed", "moved", "gone", "new", "unconfirmed")
-"""What can become of an object over several sessions, in the order in which it is shown. A comparison of two maps uses the
-same words."""
+"""What can become of an object over several sessions. Outputs show these words in this order. A comparison of two maps uses
+the same words."""
 
 _FLOOR = 1e-6  # The least standard deviation (m) between two positions. It keeps singular covariances invertible.
 _SHOWN = 20  # The most objects in the text of a map. A larger number makes the text longer.
@@ -38,10 +38,10 @@ COLUMNS: dict[str, str] = {
     **{"state": "string", "probability": "float64", "sessions_expected": "int64", "sessions_seen": "int64"},
     **dict.fromkeys(("updated", "moved_from_x", "moved_from_y", "moved_from_z"), "float64"),
 }
-"""The columns of a table of objects with their types: positions and sizes are in m, covariances in m^2, stamps in s, yaws in
-rad. size_l, size_w and size_h are length, width and height of the body. width and height are of the boxes. tag_qx to tag_qw
-are the unit quaternion of map_R_tag of a fiducial. The columns from state on are from `Life`. Only the map of a site has
-values there."""
+"""The columns of a table of objects, with their types. Positions and sizes are in m, covariances in m^2, stamps in s, yaws
+in rad. size_l, size_w and size_h are length, width and height of the body. width and height are the `extent` of the object.
+tag_qx to tag_qw are the unit quaternion of map_R_tag of a fiducial. The columns from state on are from `Life`. They are
+empty except in the map of a site."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +62,12 @@ class Life:
     """The history of one object over several sessions.
 
     state: `unconfirmed` if one session found it, and no other session had its place in view. `new` if one session found it,
-    and an earlier one would have found it there, or does not say what it had in view. `confirmed` if a later session found
-    it again, `moved` if a later session found it at another position, `gone` if it is no longer there. probability: that the
-    object is still at its position. sessions_expected, sessions_seen: in how many sessions it was in view, and in how many
-    it was found. looks, detections: in how many camera frames of all sessions it was in view, and in how many it was
-    detected. updated: the time of the last session, s. moved_from: (3,) m, where it was before it moved, None if it did not
-    move.
+    and an earlier session would have found it there, or does not say what it had in view. `confirmed` if a later session
+    found it again, `moved` if a later session found it at another position, `gone` if later sessions show that it has left.
+    probability: the probability that the object is still at its position. sessions_expected, sessions_seen: in how many
+    sessions it was in view, and in how many it was found. looks, detections: in how many camera frames of all sessions it
+    was in view, and in how many it was detected. updated: the time of the last session, s. moved_from: (3,) m, where it was
+    before it moved, None if it did not move.
     """
 
     state: Fate
@@ -85,15 +85,15 @@ class MapObject:
     """One object of the map, with the fields of objects.json.
 
     position: (3,) m. covariance: (3, 3) m^2, None for an unresolved object. rays, frames: how many rays and frames support
-    the object. parallax_deg: the widest angle between two of these rays. rms_deg: the root mean square of the angles between
+    the object. parallax_deg: the widest angle between two such rays. rms_deg: the root mean square of the angles between
     these rays and the object. first_seen, last_seen: stamps, s. extent: width and height, m, None if unknown. ray: the
     origin (3,), m, and the direction (3,) of one ray of an unresolved object. labels: the share of each label among the
     boxes. existence: the probability that the object exists. labels and existence are None if the run took all boxes of a
     label as one object. seen_from: from where it was detected, None if unknown. life: its history over several sessions,
-    None in the map of a single run. tag: the rotation and size of a fiducial, None for another object. body: its size and
-    heading around the position, None for a point. ray_point: (3,) m, where the rays through the centres of its boxes meet,
-    None if that is the position itself. features: (D,) the unit appearance vector of its best view, which is its largest box
-    that lies inside the image. None if its boxes have none.
+    None in the map of a single run. tag: the rotation and size of a fiducial, None for an object that is no fiducial. body:
+    its size and heading around the position, None for a point. ray_point: (3,) m, where the rays through the centres of its
+    boxes meet, None if they meet at the position. features: (D,) the unit appearance vector of its best view, which is its
+    largest box that lies inside the image. None if its boxes have none.
     """
 
     id: int
@@ -169,9 +169,9 @@ class ObjectMap:
     """The objects of one map, in the coordinate frame that `frame` names.
 
     A map is a sequence of its objects. Spatial queries return resolved objects only. The first query makes an index, so that
-    later queries are quick in large maps too. A point is x, y, z in m, or x, y to ignore heights. gone: objects of earlier
-    sessions that are no longer there. shared_covariance: (7, 7) of the error that all objects share
-    (`core.maps.shared_covariance`). The covariances of the objects contain it. None if it is not known.
+    later queries are also quick in large maps. A point is x, y, z in m, or x, y to ignore heights. gone: objects of earlier
+    sessions that have left. shared_covariance: (7, 7) of the error that all objects share (`core.maps.shared_covariance`),
+    None if unknown. The covariances of the objects contain it.
     """
 
     objects: tuple[MapObject, ...]
@@ -205,7 +205,7 @@ class ObjectMap:
         return "\n".join([head, *(f"  {o}" for o in self.objects[:_SHOWN]), *more])
 
     def by_id(self, number: int) -> MapObject:
-        """Return the object with an id. KeyError if there is none."""
+        """Return the object with an id. KeyError if no object has the id."""
         for one in self.objects:
             if one.id == number:
                 return one
@@ -249,7 +249,7 @@ class ObjectMap:
     def search(self, vector: ArrayLike, k: int = 5) -> tuple[tuple[MapObject, float], ...]:
         """Return the k objects that look most like an appearance vector (D,), and their cosines to it, the largest first.
 
-        Unresolved objects are found too, objects without a vector are not. The vector must come from the encoder that made
+        Unresolved objects are also found. Objects without a vector are not. The vector must come from the encoder that made
         the vectors of the map. ValueError if it has another length, or is zero or not finite.
         """
         seen = [(o, o.features) for o in self.objects if o.features is not None]

@@ -1,4 +1,5 @@
-"""The result of a run, from which every output is made: the map, the doubts about it, and the surface of the room."""
+"""The result of a run, from which every output is made. It has the map, the doubts about the map, and the surface of the
+room."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, Self
@@ -25,9 +26,10 @@ with a wide sigma, boxes that became no object, and a label without an object.""
 class Doubt:
     """One doubt about a map.
 
-    reason: short and fixed, for programs. label: of the object or the boxes. text: one sentence, for people. objects: the
-    ids of the objects that it is about. position: (3,) m, where it is, None if it belongs to no place. rays: the rows of its
-    boxes in rays.parquet. numbers: the measured numbers behind the sentence, with units in their names.
+    reason: short and fixed, for programs. label: the label of the objects or boxes in doubt. text: one sentence, for people.
+    objects: the ids of the objects in doubt. position: (3,) m in map, where the doubt is, None if it belongs to no place.
+    rays: the rows of the boxes in doubt in rays.parquet. numbers: the measured numbers behind the sentence, with units in
+    their names.
     """
 
     kind: DoubtKind
@@ -77,15 +79,15 @@ class RunResult:
     """The result of a run with K keyframes and R rays.
 
     keyframes: the keyframes with their poses before the estimation. map_T_base: (K, 4, 4) their poses after the estimation.
-    The mode `fixed` does not change them. association: its objects are indices into map.objects. origins, directions: (R, 3)
-    the rays in map at the solved poses. residual: (R,) rad, the angle between each ray and its object, NaN without an
-    object. weight: (R,) robust weight in [0, 1]. summary: the content of summary.json. path, path_after: the path of the log
-    at its full rate, before and after the estimation. trace: the rounds of the estimation. images: the image files of each
-    camera. surface: the surroundings, None without depth images. surface_before: the surroundings at the poses before the
-    estimation, None unless the settings ask for it. calibration: the shared errors that were estimated, None if none were.
-    residual_before: (R,) rad, the residual before the correction of the shared errors, None if none were estimated. views:
-    all camera frames on the path, also frames without a box, at the solved poses. None if they were not asked for. doubts:
-    what is doubtful in the result, in words. Their rays are indices into `rays`.
+    The mode `fixed` does not change them. association: the object of each ray, as an index into map.objects. origins,
+    directions: (R, 3) the rays in map at the solved poses. residual: (R,) rad, the angle between each ray and its object,
+    NaN without an object. weight: (R,) robust weight in [0, 1]. summary: the content of summary.json. path, path_after: the
+    path of the log at its full rate, before and after the estimation. trace: the rounds of the estimation. images: the image
+    files of each camera. surface: the surroundings, None without depth images. surface_before: the surroundings at the poses
+    before the estimation, None unless the settings ask for it. calibration: the shared errors that were estimated, None if
+    none were. residual_before: (R,) rad, the residual before the correction of the shared errors, None if none were
+    estimated. views: all camera frames on the path, also frames without a box, at the solved poses. None if they were not
+    asked for. doubts: what is doubtful in the result, in words. The rays of a doubt are indices into `rays`.
     """
 
     map: ObjectMap

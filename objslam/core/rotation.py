@@ -8,8 +8,8 @@ import numpy as np
 from objslam.core.arrays import Floats
 
 _SMALL = 1e-4
-"""If the sine of a rotation angle, or of half of it, is smaller than this, a series replaces angle / sine, which tends to
-0 / 0. A larger value makes the series less exact. At this value, its relative error is below 1e-17."""
+"""The sine of a rotation angle, or of half of the angle, below which a series replaces angle / sine. That ratio tends to 0 /
+0. A larger value makes the series less exact. At this value, its relative error is below 1e-17."""
 
 
 def _cross_product_map() -> Floats:
@@ -40,7 +40,7 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 
 def dots(a: Floats | tuple[Floats, ...], b: Floats) -> Floats:
-    """Return the products (P,) of vectors (3, P)."""
+    """Return the dot products (P,) of pairs of vectors (3, P), one in each column."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 

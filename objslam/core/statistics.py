@@ -12,24 +12,23 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 
 SAME_POINT = 11.345
-"""The squared Mahalanobis distance between two estimates of one point is below this value in 99 % of all cases (chi-squared,
-3 degrees of freedom). A larger value treats more pairs of estimates as one point."""
+"""The 99 % quantile of the squared Mahalanobis distance between two estimates of one point (chi-squared, 3 degrees of
+freedom). A larger value treats more pairs of estimates as one point."""
 SAME_POINT_WIDE = 16.266
-"""The squared Mahalanobis distance between two estimates of one point is below this value in 99.9 % of all cases
-(chi-squared, 3 degrees of freedom). A larger value lets more pairs compete for an assignment."""
+"""The 99.9 % quantile of the squared Mahalanobis distance between two estimates of one point (chi-squared, 3 degrees of
+freedom). A larger value lets more pairs compete for an assignment."""
 POSSIBLE_MOTION = 14.156
-"""The squared deviation of 99.73 % of planar motions in x, y and yaw is below this value (chi-squared, 3 degrees of
-freedom). This percentage is the share of a Gaussian within 3 standard deviations. A larger value tries less likely
-motions."""
+"""The 99.73 % quantile of the squared deviation of a planar motion in x, y and yaw (chi-squared, 3 degrees of freedom). This
+percentage is the share of a Gaussian within 3 standard deviations. A larger value tries less likely motions."""
 STRAY_RAY = 13.816
-"""The squared deviation of 99.9 % of an object's own rays is below this value (chi-squared, 2 degrees of freedom). It is
-also the cost of a ray that fits no object. A larger deviation gives rays of other things more influence on the solution."""
+"""The 99.9 % quantile of the squared deviation of an object's own rays (chi-squared, 2 degrees of freedom). It is also the
+cost of a ray that fits no object. A larger deviation gives rays of other things more influence on the solution."""
 OUTLIER_RAY = 4.0
-"""The deviation above which a ray is rejected. 3e-4 of an object's own rays exceed it (Rayleigh, exp(-4^2 / 2)). A larger
-deviation keeps more false boxes."""
+"""The deviation above which a ray is rejected. A share of 3e-4 of an object's own rays exceeds it (Rayleigh, exp(-4^2 / 2)).
+A larger deviation keeps more false boxes."""
 CLIPPED_RAY = 6.0
-"""In the measured noise of an object, a ray with a larger deviation counts as if it had this deviation. A larger value lets
-a false box raise this noise more."""
+"""The largest deviation with which a ray counts in the measured noise of an object. A ray with a larger one counts as if it
+had this deviation. A larger value lets a false box raise this noise more."""
 HALF_RAY = 6.0
 """The squared deviation at which a ray has half of its full weight in a fit of points (Cauchy's weight, about `CAUCHY_K`
 squared). A larger deviation gives rays of other things more influence."""
@@ -53,8 +52,8 @@ MOST_NOISE_FACTOR = 5.0
 """The largest factor by which outlier rejection multiplies the nominal noise of an object's rays. It is large because the
 box centres of a large object vary. A larger factor keeps more rays of noisy objects."""
 NOISE_MEASURED_BY = 6
-"""The noise of an object's rays is measured if at least this number of them are inliers. With fewer inliers, the noise of
-the settings counts. A larger number rejects more rays of noisy objects."""
+"""The least number of inliers from which the noise of an object's rays is measured. With fewer inliers, the noise of the
+settings counts. A larger number rejects more rays of noisy objects."""
 POOLED_WITH_CLASS = 30.0
 """The number of rays at which the measured noise of an object and the noise of its class have equal weight, offline. At the
 same number of rays of a class, the noise of the class and the nominal noise have equal weight. A larger number keeps objects
@@ -63,11 +62,10 @@ POOLED_WITH_PROMISE = 20.0
 """The number of rays at which the measured noise of an object and the nominal noise have equal weight, live. A larger number
 keeps objects near the nominal noise for longer."""
 _LARGE_GROUPS = 100
-"""With more than this number of values in a group, on average, a partition of each group is faster than a sort of all
-values: 2.8 against 7.4 ms for 200,000 values in 200 groups. A larger number sorts more often."""
+"""The mean number of values in a group above which a partition of each group is faster than a sort of all values. For
+200,000 values in 200 groups, the partition took 2.8 ms and the sort 7.4 ms. A larger number sorts more often."""
 _FEW_GROUPS = 1 << 16
-"""The number of values of 16 bits. Up to this number of groups, the index of a group fits into 16 bits, which numpy sorts
-several times as fast."""
+"""The most groups whose indices fit into 16 bits. numpy sorts such indices several times as fast."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ class Lasting:
     seconds: float = 0.0
 
     def like(self, other: "Lasting", tolerance: float) -> bool:
-        """Return whether the shares differ by less than a tolerance, and the logarithms of the times as well."""
+        """Return whether the shares differ by less than a tolerance, and the logarithms of the times also do."""
         if not self.share or not other.share:
             return self.share == other.share
         times = abs(math.log(max(self.seconds, 1e-9) / max(other.seconds, 1e-9)))
@@ -104,8 +102,8 @@ def noise_factors(deviations: Floats, index: Ints, count: int, fewest: int = 1) 
 
 
 def widening(residual: Floats, index: Ints, count: int) -> Floats:
-    """Return the factor (N,) >= 1 on the covariance of each object. It is above 1 if rays miss the object by more than their
-    noise.
+    """Return the factor (N,) >= 1 on the covariance of each object. The factor is above 1 if rays miss the object by more
+    than their noise.
 
     The factor is the squared ratio of the measured noise to the noise of the settings. residual: (R,) in units of the noise
     of the settings. index, count: as in `noise_factors`.
@@ -159,7 +157,8 @@ def grouped_sums(values: Floats, index: Ints, count: int) -> Floats:
 def grouped_visits(stamps: Floats, index: Ints, away: float) -> Ints:
     """Return the visit (R,) of each ray: rays of one object without a gap of more than `away` seconds between them.
 
-    Visits of one object have consecutive numbers, and no visit has rays of two. stamps: (R,) s. index: (R,) the object."""
+    Visits of one object have consecutive numbers, and no visit has rays of two objects. stamps: (R,) s. index: (R,) the
+    object of each ray."""
     order = np.lexsort((stamps, index))
     begins = np.append(False, (np.diff(index[order]) != 0) | (np.diff(stamps[order]) > away))[: len(index)]
     visit = np.zeros(len(index), dtype=np.int64)
@@ -185,7 +184,7 @@ def distinct(values: Ints) -> Ints:
 
 
 def quantile(values: Floats, share: float) -> float:
-    """Return the value at a share (0 to 1) of the sorted values (R,), at least one, interpolated between two neighbours.
+    """Return the value at a share (0 to 1) of the sorted values (R,), interpolated between two neighbours. R is at least 1.
 
     `np.quantile` returns the same. For some tens of values it takes ten times as long, and a session needs it at each
     keyframe.
@@ -197,17 +196,17 @@ def quantile(values: Floats, share: float) -> float:
 
 
 _FEW = 20_000
-"""Up to this many numbers, special functions are computed without scipy.special. Its import takes 0.06 s, about as long as
+"""The most numbers for which special functions are computed without scipy.special. Its import takes 0.06 s, about as long as
 the association of a small log. The computation without it takes 0.02 s for this many numbers."""
 _DEVIATIONS = 9.0
-"""A Poisson tail is summed up to this many standard deviations above the mean. Its square is added, for small means. What
-lies beyond is below 1e-16 of the tail. With a larger number, the sum is longer."""
+"""The number of standard deviations above the mean up to which a Poisson tail is summed. For small means, the square of this
+number is added to the limit. What lies beyond is below 1e-16 of the tail. A larger number makes the sum longer."""
 
 
 def logistic(odds: Floats) -> Floats:
     """Return the probabilities (N,) of log odds (N,): 1 / (1 + exp(-odds)), without overflow.
 
-    scipy.special has it too, as `expit`, but its import takes 0.04 s.
+    `scipy.special.expit` returns the same, but its import takes 0.04 s.
     """
     return np.asarray(np.exp(-np.logaddexp(0.0, -odds)))
 
@@ -215,8 +214,8 @@ def logistic(odds: Floats) -> Floats:
 def poisson_tail(least: Ints, mean: Floats) -> Floats:
     """Return the probability (...) that a Poisson variable of this mean (...) is at least `least` (...).
 
-    It is the regularised incomplete gamma function (NIST DLMF 8.4.10). For few numbers, the probabilities of all counts are
-    summed instead. scipy.stats has the tail too, but its import takes 0.3 s.
+    The tail is the regularised incomplete gamma function (NIST DLMF 8.4.10). For few numbers, the probabilities of all
+    counts are summed instead. scipy.stats has this function, but its import takes 0.3 s.
     """
     count, mean = np.maximum(least, 1).ravel().astype(np.float64), mean.ravel()
     beyond = np.maximum(mean - count, 0.0) + _DEVIATIONS * np.sqrt(np.maximum(mean, count)) + _DEVIATIONS**2

@@ -49,7 +49,8 @@ class Round:
 
     why: `fixed` for fixed poses, `labels` for one object per label, `association` for a new association at the current
     poses, `merge` for merged copies of one object, `split` for objects that may be two, `few rays` for objects that few rays
-    show, `bodies` for bearings to bodies' centres. map_T_base: (K, 4, 4). positions: (N, 3) m. weight: (R,) of each ray.
+    show, `bodies` for bearings to bodies' centres. map_T_base: (K, 4, 4). positions: (N, 3) m. weight: (R,) the robust
+    weight of each ray.
     """
 
     why: Why
@@ -65,7 +66,7 @@ class Trace:
     """A collector of the rounds of an estimation.
 
     base_T_camera: (K, 4, 4) the camera on the robot at each keyframe. count: the number of objects, which are the first
-    positions of an iteration. The positions behind them, such as further corners of fiducials, are left out. None keeps all.
+    positions of an iteration. Later positions, such as the corners of fiducials, are left out. None keeps all positions.
     """
 
     base_T_camera: Floats

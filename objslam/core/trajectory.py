@@ -16,8 +16,9 @@ _SPAN = 0.4
 class Trajectory:
     """Poses of one coordinate frame in another over time.
 
-    stamps: (N,) s, finite, strictly increasing. poses: (N, 4, 4) homogeneous, finite. travel: (N, 3) the sum of
-    `travel` since the previous pose, over all measured poses. None if none was left out. ValueError otherwise.
+    stamps: (N,) s, finite, strictly increasing. poses: (N, 4, 4) homogeneous, finite. travel: (N, 3) what the function
+    `travel` returns, summed over all measured poses since the previous pose. None if no measured pose was left out.
+    ValueError if an array is not as described.
     """
 
     stamps: Floats
@@ -60,8 +61,8 @@ def usual_seconds(seconds: Floats) -> Floats:
 def travel(poses: Floats) -> Floats:
     """Return how far a path with poses (N, 4, 4) goes from each pose to the next: (N - 1, 3).
 
-    The columns are the length of the way, m, the size of the turn, rad, and the turn about the vertical axis with its sign,
-    rad. If poses are left out, the row of the longer step is the sum of the rows of the steps that it replaces.
+    The columns are the length of the way (m), the size of the turn (rad), and the signed turn about the vertical axis (rad).
+    If poses are left out, the row of the longer step is the sum of the rows of the steps that it replaces.
     """
     turn, way = twist_lengths(inverse(poses[:-1]) @ poses[1:])
     rotation = poses[:, :3, :3]

@@ -34,13 +34,13 @@ class Detections:
 
     frame_stamps: (F,) s, strictly increasing. frame: (M,) index into frame_stamps, non-decreasing. boxes: (M, 4) x1, y1, x2,
     y2 in px of the raw (distorted) image. label: (M,) index into label_names. scores: (M,) in [0, 1]. depths: (M,) z along
-    the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: whether the image's edge cuts off
-    no box. This is so for fiducials, because a detector must see all their corners. If it is True, the centres of boxes at
-    the edge are valid too. corners: (M, 4, 2) px of the raw image, the corners of a square fiducial in its own order, NaN
-    for another box. None if no box has corners. features: (M, D) unit appearance vectors, a row of NaN for a box without
-    one. None if no box has one. second: (M,) index into label_names, the label of a box that was dropped because it lay on
-    this box. It is -1 for a box on which no other box lay, and None if no box has such a label. ValueError if a shape, an
-    index or the order is wrong.
+    the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: whether the image's edge cuts off no box. This
+    is so for fiducials, because a detector must see all their corners. If so, the centres of boxes at the edge are also
+    valid. corners: (M, 4, 2) px of the raw image, the corners of a square fiducial in its own order, NaN for another box.
+    None if no box has corners. features: (M, D) unit appearance vectors, a row of NaN for a box without one. None if no box
+    has one. second: (M,) index into label_names, the label of a box that was dropped because it lay on this box. It is -1
+    for a box on which no other box lay, and None if no box has such a label. ValueError if a shape, an index or the order is
+    wrong.
     """
 
     frame_stamps: Floats
@@ -106,8 +106,8 @@ class Images:
 
 @dataclass(frozen=True)
 class CameraLog:
-    """The data of one camera. mount: base_T_camera over time, as of a camera on an arm. None if it is always that of the
-    camera."""
+    """The data of one camera. mount: base_T_camera over time, for a camera that moves on the robot. None for a camera that
+    does not move."""
 
     camera: Camera
     detections: Detections | None = None
@@ -141,9 +141,9 @@ class Truth:
 class Log:
     """The log of a robot, with odometry, localisation or both.
 
-    odometry: odom_T_base. localization: map_T_base. path: the file or folder that was read, absolute, None from memory.
-    reading: the data dropped while the log was read, None if they were not counted. part: the begin and the end (outside),
-    s, if the log is a part of a longer log. None means no limit.
+    odometry: odom_T_base. localization: map_T_base. path: the absolute path of the file or folder that was read, None for a
+    log from memory. reading: the data dropped while the log was read, None if they were not counted. part: the begin and the
+    end, s, if the log is a part of a longer log. The end is outside the part. None means no limit.
     """
 
     name: str
@@ -171,16 +171,16 @@ class Keyframes:
     for each measured absolute pose, on average and at least 1. 0 if map_T_base is odometry. localized_at: (K,) s, the stamp
     of the measurement of the localisation that gave the pose, NaN if the odometry continued the localisation. None if each
     pose was measured by itself. carried: (K, 2) rad^2 and m^2, what the odometry from this measurement to the keyframe adds
-    to the variance of heading and place, None if nothing. overlap: the share of the keyframes of one moment that can show
-    the same thing: 1 for one camera, a quarter for four that look to four sides. pose_noise: the factors on
+    to the variance of heading and place, None if it adds nothing. overlap: the share of the keyframes of one moment that can
+    show the same thing: 1 for one camera, a quarter for four that look to four sides. pose_noise: the factors on
     `localization.yaw` and `localization.xy` that the log shows, 1 if they are not estimated. lasting: the parts of the
     errors of headings and of places that last, in joint mode. odom_T_base: (K, 4, 4) in the frame of the first odometry
     pose, None without odometry. drift: (K, 6, 6) covariance, rotation first, of the odometry's error since its start, in
-    this frame. stretch: (K,) the number of each keyframe's stretch of the odometry between two gaps, None means one stretch
-    for all. It is -1 without odometry, where odom_T_base and drift have no meaning. step: (K,) the place of each keyframe
-    among the steps of the odometry. wander: (K, 6) the variance of that step. Both are from `OdometryBridge.at`, and None if
-    the odometry is exact between its poses. given_stamps: (K,) s, as the frames have them in the log or came from the robot,
-    None if they are `stamps`. driven: (K,) m, the `way` before any correction, None if nothing was corrected.
+    this frame. stretch: (K,) the number of the stretch of odometry, between two gaps, that each keyframe is in. None means
+    one stretch. It is -1 without odometry, where odom_T_base and drift have no meaning. step: (K,) the place of each
+    keyframe among the steps of the odometry. wander: (K, 6) the variance of that step. Both are from `OdometryBridge.at`,
+    and None if the odometry is exact between its poses. given_stamps: (K,) s, the stamps of the frames in the log or from
+    the robot, None if they are `stamps`. driven: (K,) m, the `way` before any correction, None if nothing was corrected.
     """
 
     stamps: Floats
@@ -255,9 +255,9 @@ class Rays:
     object. None if no ray has corners. corner_sigma: (R,) rad, the nominal noise of each corner along each of two axes. cut:
     the cut off boxes of the same images, None if they were not collected. feature: (R,) the row of each ray's appearance
     vector in feature_table, -1 without a vector. feature and feature_table are None if no ray has a vector. surface: (R, 2)
-    two numbers for each range, which was lengthened from a surface to the centre behind it. The first number says by how
-    much, as a share of half the width. The second is the weight of the shared error `surface`, which is added to this share.
-    None means `depth.centre` and 1. second: (R,) as in `Detections`, an index into label_names.
+    two numbers for each range. Ranges were lengthened from the surface of a thing to its centre. The first number is the
+    added length, as a share of half the width. The second is the weight with which the shared error `surface` is added to
+    this share. None means `depth.centre` and 1. second: (R,) the second label of each box, as in `Detections`.
     """
 
     keyframe: Ints
@@ -326,6 +326,6 @@ class Association:
 
 def label_table(names: Sequence[str]) -> tuple[tuple[str, ...], Ints]:
     """Return the distinct names in sorted order, and for each of the names (len(names),) its index among them."""
-    table = tuple(sorted({str(name) for name in names}))  # numpy has its own text, whose repr would stand in messages.
+    table = tuple(sorted({str(name) for name in names}))  # The repr of numpy's own text type looks odd in messages.
     index = {name: i for i, name in enumerate(table)}
     return table, np.array([index[name] for name in names], dtype=np.int64)

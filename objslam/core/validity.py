@@ -8,11 +8,11 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.camera import COEFFICIENTS, Camera, RangeNoise
 
 MAX_POSITION = 1e7
-"""The bound of a coordinate or a depth, m. A larger bound accepts more wrong numbers. No place on earth is further from the
-origin of its UTM zone, and a float still resolves 2 nm there."""
+"""The bound of a coordinate or a depth, m. A larger bound accepts more wrong numbers. No place on earth is farther from the
+origin of its UTM zone. At this bound, a float resolves 2 nm."""
 MAX_STAMP = 1e20
 """The bound of a stamp in a file, s. A larger bound accepts more wrong numbers. A stamp that is in ns by mistake is below
-it, so the checks of a run can name this mistake."""
+the bound, so the checks of a run can name this mistake."""
 MAX_LIVE_STAMP = 1e11
 """The bound of a stamp of a running robot, s. A larger bound accepts more wrong numbers. At this bound, a float
 resolves 15 us."""
@@ -22,7 +22,7 @@ _LAST_DATE = 9e9
 """The Unix time, s, up to which a stamp counts as a date. A larger bound overflows the 64 bits of a time in ns."""
 MAX_PIXEL = 1e7
 """The bound of a box corner and of an element of a camera matrix, px. A larger bound accepts more wrong numbers. The largest
-image is a hundredth of it."""
+image is a hundredth of this bound."""
 MAX_SIDE = 1 << 16
 """The largest width and height of an image, px. A larger value accepts more wrong numbers. No robot's camera has more."""
 MAX_DISTORTION = 1e6
@@ -36,20 +36,20 @@ _RIGID = 1e-3
 """The largest difference between R^T R and the identity in any entry. A larger value accepts worse rotations. Rotations that
 are printed with four decimals are below it."""
 _ROUNDING = 1e-12
-"""R stays unchanged, bit by bit, if no entry of R^T R differs from the identity by more than this. A larger value leaves
-more rotations inexact. A product of a hundred rotations is below it."""
+"""The largest difference between R^T R and the identity in any entry at which R stays unchanged, bit by bit. A larger value
+leaves more rotations inexact. A product of a hundred rotations is below it."""
 _SHORTEST, _LONGEST = 1e-6, 1e3
 """The bounds of the length of a quaternion. Wider bounds accept more wrong quaternions. A valid quaternion has length 1, but
-some programs do not normalise theirs."""
+some programs do not normalise their quaternions."""
 _ASYMMETRY = 1e-6
-"""The largest difference of two mirrored entries of a covariance, as a share of the product of the two standard deviations.
-A larger share accepts numbers that were rounded to fewer digits."""
+"""The largest difference between two mirrored entries of a covariance, as a share of the product of the two standard
+deviations. A larger share accepts numbers that were rounded to fewer digits."""
 _NOTHING = 1e-200
 """The largest variance, in the square of any unit, that counts as 0. Products of smaller numbers have few digits left. A
 larger value leaves more correlations unchecked."""
 _NEGATIVE = 1e-6
-"""The least eigenvalue of a correlation matrix may be this far below 0, and a correlation may be this far beyond 1. A larger
-value accepts numbers that were rounded to fewer digits."""
+"""The tolerance of correlations. The least eigenvalue of a correlation matrix may be this far below 0, and a correlation may
+be this far beyond 1. A larger value accepts numbers that were rounded to fewer digits."""
 
 
 def valid_stamps(stamps: Floats, bound: float = MAX_STAMP) -> Bools:
@@ -68,7 +68,7 @@ def valid_positions(positions: Floats) -> Bools:
 
 
 def is_valid_position(x: float, y: float, z: float) -> bool:
-    """Return whether one position, m, is valid, as `valid_positions` does, in a tenth of the time."""
+    """Return whether one position x, y, z, m, is valid by `valid_positions`. This takes a tenth of the time."""
     return -MAX_POSITION < x < MAX_POSITION and -MAX_POSITION < y < MAX_POSITION and -MAX_POSITION < z < MAX_POSITION
 
 
@@ -107,7 +107,7 @@ def rigid_poses(poses: Floats) -> tuple[Floats, Bools]:
 
 
 def rigid_pose(pose: Floats) -> Floats | None:
-    """Return a rigid pose (4, 4) with an exact rotation, as `rigid_poses` does; None if the pose is not rigid."""
+    """Return a rigid pose (4, 4) with an exact rotation, as `rigid_poses` does. None if the pose is not rigid."""
     if _is_exact(pose):
         return pose.copy()
     exact, good = rigid_poses(pose[None])
@@ -136,7 +136,7 @@ def _is_exact(pose: Floats) -> bool:
 
 
 def covariance_fault(covariance: Floats) -> str | None:
-    """Return what is wrong with covariances (..., P, P), in words that follow their name; None if all are valid.
+    """Return what is wrong with covariances (..., P, P), in words that follow their name. None if all are valid.
 
     A covariance is finite, symmetric and not negative in any direction. Symmetry and sign are judged on the correlations,
     because the units of a covariance differ.
@@ -163,7 +163,7 @@ def covariance_fault(covariance: Floats) -> str | None:
 def camera_fault(camera: Camera) -> str | None:
     """Return what is wrong with a camera whose fields have the right types, in words that follow "camera"; None if valid.
 
-    This checks the pose of the camera, and does not correct it. `rigid_pose` does.
+    The pose of the camera is checked, but not corrected. `rigid_pose` corrects it.
     """
     matrix = camera.matrix
     if (fault := _matrix_fault(matrix)) is not None:
@@ -206,13 +206,13 @@ def _possible(noise: RangeNoise) -> bool:
 
 
 def is_date(stamp: float) -> bool:
-    """Return whether a stamp, s, is Unix time, because it is above about three years. Other clocks start at 0 and stay below
-    this."""
+    """Return whether a stamp, s, is Unix time. Such a stamp is above 1e8 s, about three years. Other clocks start at 0 and
+    stay below it."""
     return 1e8 < stamp < _LAST_DATE
 
 
 NO_LABEL = ""
-"""The label of a box without a usable one. It is not a name, so the box is invalid."""
+"""The label of a box whose own label is missing or unusable. It is not a name, so the box is invalid."""
 
 
 def is_name(value: object) -> bool:

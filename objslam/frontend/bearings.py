@@ -16,7 +16,7 @@ from objslam.frontend.surface_ranges import half_widths, to_centres
 CUT_OFF = "boxes cut off by the image's edge (rays.border, rays.border_share)"
 """The reason to drop a box that ends at the image's edge, because its centre is then wrong."""
 MAX_OF_LABEL = 1000
-"""The most boxes that are used of one label in one frame. A larger number takes more memory and time in a crowd."""
+"""The most boxes of one label in one frame that are used. A larger number takes more memory and time in a crowd."""
 
 
 def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledger) -> Rays:
@@ -127,9 +127,10 @@ def _corner_rays(boxes: Detections, camera: Camera, settings: Settings, ledger: 
 
 
 def _features(boxes: Detections, before: list[Floats32 | None], camera: Camera, ledger: Ledger) -> Floats32 | None:
-    """Return the appearance vectors (M, D) of boxes, None if they have none.
+    """Return the appearance vectors (M, D) of boxes, None if the boxes have none that can be used.
 
-    Vectors can be compared only if they have the length of earlier cameras' vectors. The ledger counts the others.
+    Vectors of all cameras are compared, so they must have equal lengths. The first camera with vectors gives the length. The
+    ledger counts the vectors of another length.
     """
     if boxes.features is None:
         return None
@@ -142,9 +143,10 @@ def _features(boxes: Detections, before: list[Floats32 | None], camera: Camera, 
 
 
 def _table(features: list[Floats32 | None], counts: list[int]) -> tuple[Ints | None, FeatureTable | None]:
-    """Return the row of each ray (R,) in a table of all vectors, -1 without a vector, and the table. None without vectors.
+    """Return the row of each ray (R,) in a table of all vectors, -1 without a vector, and the table. Both are None without
+    vectors.
 
-    features: the vectors of the boxes of each camera. counts: the numbers of these boxes.
+    features: the vectors of the boxes of each camera. counts: the number of boxes of each camera.
     """
     row, rows, at = np.full(sum(counts), -1, dtype=np.int64), list[Floats32](), 0
     for vectors, count in zip(features, counts, strict=True):
@@ -224,7 +226,7 @@ def _wrong(boxes: Floats, scores: Floats, camera: Camera, settings: Settings) ->
 
 
 def cut_edges(boxes: Floats, camera: Camera, settings: Settings) -> Bools:
-    """Return which edges (M, 4) of boxes (M, 4), px, are so near to the image's edge that the box may be cut off there."""
+    """Return which edges (M, 4) of boxes (M, 4), px, are near to the image's edge, so that the image may cut off the box."""
     low, high = boxes[:, :2], boxes[:, 2:]
     border = np.maximum(settings.rays.border, settings.rays.border_share * (high - low))
     return np.concatenate([low <= border, high >= camera.size - 1 - border], axis=1)
@@ -262,7 +264,7 @@ def _angle_sigma(camera: Camera, directions: Floats, boxes: Floats, settings: Se
 
 
 def _radians(camera: Camera, directions: Floats, pixels: Floats) -> Floats:
-    """Return the angles (n,), rad, of distances (n,) px in the image, at unit directions (n, 3)."""
+    """Convert distances (n,), px, in the image at unit directions (n, 3) to angles (n,), rad, between rays."""
     # For each radian of ray angle, a pinhole image moves by f / cos(a)^2 along the radius and by f / cos(a) across it. Here
     # a is the angle off the axis. The geometric mean gives one sigma for the ray. A fisheye image moves by f everywhere.
     if camera.fisheye:

@@ -22,11 +22,11 @@ _MIN_VALID_SHARE = 0.1
 """The least share of valid pixels for a depth to be read. A larger share leaves more boxes without a depth."""
 _LEAST_SHOWN = 0.1
 """The least share of the valid pixels that show the thing, if the others show what is behind it. A larger share takes thin
-things, such as a tripod, for the wall behind them. With a smaller share, a few nearer pixels are taken for the thing,
-although they only hide a strip of it."""
+things, such as a tripod, for the wall behind them. With a smaller share, a few nearer pixels that only hide a strip of the
+thing are taken for the thing."""
 _APART = 4.0
-"""Two surfaces are different if their depths differ by at least this number of standard deviations of the nearer depths. The
-halves of one Gaussian differ by 2.3, and the halves of a plane that recedes by 2.7. With a larger number, fewer backgrounds
+"""The least distance between the depths of two different surfaces, in standard deviations of the nearer depths. The halves
+of one Gaussian are 2.3 apart, and the halves of a plane that recedes are 2.7 apart. With a larger number, fewer backgrounds
 are found."""
 MAX_IMAGE_LAG = 0.02
 """The longest time (s) between the stamps of the colour image and the depth image of one frame. Some cameras give the two

@@ -1,4 +1,4 @@
-"""Names of numbered classes, from a file or a known list, and the labels of boxes that are such numbers."""
+"""Names of numbered classes, from a file or a known list. They replace labels that are class numbers."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ KNOWN: dict[str, dict[int, str]] = {"coco": dict(enumerate(COCO_NAMES)), "coco91
 def load_names(given: str, folders: Sequence[Path] = ()) -> dict[int, str]:
     """Return the names of classes by their numbers: from a known list or from a file.
 
-    given: coco, coco91, or a file, which is looked up as given, then in `folders`. The file has a name in each line, or is
-    YAML or JSON: a list, a mapping by number, or either under the key `names`, as the data.yaml of YOLO. ConfigError if the
-    file is missing or unreadable, or a name is empty or not printable.
+    given: coco, coco91, or the path of a file. The path is tried as given, and then in `folders`. The file has a name in
+    each line, or is YAML or JSON. YAML and JSON hold a list, a mapping by number, or either of them under the key `names`,
+    as in the data.yaml of YOLO. ConfigError if the file is missing or unreadable, or a name is empty or not printable.
     """
     if given in KNOWN:
         return KNOWN[given]
@@ -94,8 +94,8 @@ def named(label: str, names: Mapping[int, str]) -> str | None:
 def with_names(log: Log, given: str, ledger: Ledger) -> Log:
     """Return the log with names in place of labels that are numbers. given: as for `load_names`.
 
-    Labels whose number has no name do not change, and one warning counts their boxes. Labels of the truth become names too.
-    ConfigError as `load_names`.
+    Labels whose number has no name do not change, and one warning counts their boxes. Labels of the ground truth also become
+    names. ConfigError as for `load_names`.
     """
     names, unnamed = load_names(given), Counter[str]()
     cameras = tuple(_named_camera(one, names, unnamed) for one in log.cameras)
@@ -120,6 +120,6 @@ def _named_camera(one: CameraLog, names: Mapping[int, str], unnamed: Counter[str
         if new is None and boxes:
             unnamed[old] += boxes
     kept = [new or old for old, new in zip(found.label_names, labels, strict=True)]
-    distinct = tuple(dict.fromkeys(kept))  # Two labels may get one name, as 41 and cup.
+    distinct = tuple(dict.fromkeys(kept))  # Two labels may get one name, such as 41 and cup.
     index = np.array([distinct.index(label) for label in kept], dtype=np.int64)
     return replace(one, detections=replace(found, label=index[found.label], label_names=distinct))

@@ -16,14 +16,15 @@ from objslam.frontend.corrected_odometry import corrected_odometry
 from objslam.frontend.surface_ranges import corrected_ranges
 
 _SQUEEZED = 1e-3
-"""A clock offset may move frames beyond an end of the path. They are placed within this time (s) of that end. A larger value
-moves more frames. With a smaller value, stamps of fast cameras become equal, because float64 resolves Unix time to 0.2
-us."""
+"""The time (s) next to an end of the path into which frames beyond that end are squeezed. A clock offset may move frames
+there. A larger value moves more frames. With a smaller value, stamps of fast cameras become equal, because float64 resolves
+Unix time to 0.2 us."""
 _AHEAD = np.array([[0.0, 0.0, 1.0]])  # The direction along which depths are measured, in the camera frame.
 
 
 def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log:
-    """Return the log without known errors: its odometry, its cameras, and the stamps and depths of its frames are corrected.
+    """Return the log corrected by known errors. Its odometry, its cameras, and the stamps and depths of its frames are
+    corrected.
 
     error: the value of each error by its name, as in `Calibration`. An error that is absent is 0. stay: whether a clock
     offset leaves frames on the path (see `later`). If it is False, the offset may move frames beyond an end of the path.
@@ -36,7 +37,8 @@ def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log
 
 
 def corrected_mount(base_T_camera: Floats, error: Mapping[str, float], name: str) -> Floats:
-    """Return poses base_T_camera (..., 4, 4), turned about the axes of base and moved along them by the errors of a camera.
+    """Return poses base_T_camera (..., 4, 4), corrected by the errors of a camera: turned about the axes of base and moved
+    along them.
 
     name: the name of the camera. error: the turns (rad) and the moves (m) by name.
     """
@@ -47,7 +49,8 @@ def corrected_mount(base_T_camera: Floats, error: Mapping[str, float], name: str
 
 @lru_cache(maxsize=64)
 def _turn(roll: float, tilt: float, yaw: float) -> Floats:
-    """Return the rotation (3, 3) by the errors `AXES`. Derivatives by other errors need the same rotation many times."""
+    """Return the rotation (3, 3) by the errors `AXES`, rad. It is kept, because derivatives by other errors need the same
+    rotation many times."""
     turn = rotation_from_vector(np.array([roll, tilt, yaw]))
     turn.setflags(write=False)  # All callers get this array.
     return turn
@@ -82,11 +85,12 @@ def refocused(directions: Floats, errors: Floats | tuple[float, float, float]) -
 
 
 def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:
-    """Return stamps (N,), s, plus an offset `clock`, s. A stamp that was on the path stays on it, and the order stays.
+    """Return stamps (N,), s, plus an offset `clock`, s. A stamp that was on the path stays on the path, and the order of the
+    stamps stays.
 
-    Stamps that the offset moves beyond an end of the path are squeezed into the millisecond inside that end, where they have
-    nearly the pose of the end. All streams of a camera move alike, so an image keeps the stamp of its boxes. Without a path,
-    the offset is only added.
+    Stamps that the offset moves beyond an end of the path are squeezed into the millisecond of the path next to that end.
+    There the pose is nearly that of the end. All streams of a camera move alike, so an image keeps the stamp of its boxes.
+    Without a path, the offset is only added.
     """
     moved = stamps + clock
     if clock == 0 or path is None:

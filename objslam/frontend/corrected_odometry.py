@@ -17,7 +17,7 @@ from objslam.frontend.recent_values import RecentValues
 
 _KINDS = ("scale", "turn_scale", "turn_bias", "turn_per_m", "turn_slip", "lateral_scale")
 ODOMETRY = tuple(f"odometry.{one}" for one in _KINDS)
-"""The errors of odometry."""
+"""The names of the errors of odometry."""
 _LEVEL = 1e-6
 """The largest tilt (rad) and change of height (m) of a path whose drift is computed in the plane. The drift of any other
 path is computed in 3D, which takes longer. A larger value neglects more of a tilt."""
@@ -25,21 +25,21 @@ _CURVE = 0.5
 """The time (s) over which the curvature of a path is measured. Over a longer time, short curves count less. Over a shorter
 time, the jitter of the headings of fast odometry looks like curves."""
 _STANDS = 1e-6
-"""A shorter way (m) within `_CURVE` counts as this: the robot stands or turns on the spot. It only avoids a division by
-zero."""
+"""The least way (m) within `_CURVE`. A shorter way counts as this, because the robot stands or turns on the spot. The value
+only avoids a division by zero."""
 _STROKE = 0.5
 """The time (s) over which moves are summed before a robot is said to drive sideways. Over a longer time, the jitter of poses
 counts less, but a robot that drives to and fro seems to stand."""
 _SHARP = 0.3
-"""Steps with a larger turn (rad) do not show whether a robot drives sideways. If the turn is in one half of the step, the
+"""The largest turn (rad) of a step that shows whether a robot drives sideways. If the turn is in one half of the step, the
 step seems to go sideways by a quarter of the turn. With a larger turn, coarse odometry looks like driving sideways."""
 _SIDEWAYS = 0.05
-"""A robot drives sideways if the moves in one direction are more than this share of its way. If this way is 20 % too long,
-the path is 1 % too long, which is within the prior of the other scale. With a larger share, robots that seldom drive
-sideways have no lateral scale."""
+"""The least share of the way of a robot in each direction, if the robot drives sideways. If the way in one direction is 20 %
+too long, the path is 1 % too long, which is within the prior of the other scale. With a larger share, robots that seldom
+drive sideways have no lateral scale."""
 _KEPT = 6
-"""For how many turn scales, biases, slips and lateral scales the corrected path is kept. A round of derivatives needs six:
-the present path, and one for each of these errors. A larger number takes more memory."""
+"""The number of corrected paths that are kept, for the last values of turn scale, biases, slip and lateral scale. A round of
+derivatives needs six: the present path, and one for each error. A larger number takes more memory."""
 
 
 def corrected_odometry(odometry: Trajectory, error: Mapping[str, float]) -> Trajectory:
@@ -83,7 +83,7 @@ class CorrectablePath:
 
     @cached_property
     def _driven(self) -> Floats:
-        """(N,) m, how far the robot has driven ahead since the first pose. A way backwards counts as negative."""
+        """(N,) m, how far the robot has driven ahead since the first pose. Driving backwards counts as negative."""
         x, y, _ = self._ways
         left_x, left_y = self._left
         ahead = left_y * x - left_x * y
@@ -103,7 +103,7 @@ class CorrectablePath:
 
     @cached_property
     def drives_sideways(self) -> bool:
-        """Whether the robot drives in all directions, as with mecanum wheels, omni wheels or legs. For a planar path.
+        """Whether the robot drives in all directions, as with mecanum wheels, omni wheels or legs. The path must be planar.
 
         The moves of base are summed over the time `_STROKE`, so the jitter of poses counts little. A base beside the axis of
         the wheels moves sideways in turns. So the part of the moves that follows the turns does not count. The axes of base
@@ -130,7 +130,7 @@ class CorrectablePath:
 
     @cached_property
     def bridge(self) -> OdometryBridge:
-        """How far the path may be from the interpolated path. The errors hardly change this."""
+        """How far the robot may be from the interpolated path. The errors of the odometry hardly change this."""
         return bridge_of(self.odometry)
 
     def path(self, error: Mapping[str, float]) -> Trajectory:
@@ -210,7 +210,7 @@ class CorrectablePath:
 def gripping(slip: float, curvature: Floats) -> Floats:
     """Return the ratio (...) of the true length of steps to the length in the odometry, from 0 to 2.
 
-    slip: m by which a length is too long for each radian of turning. curvature: (...) rad/m of the path, positive.
+    slip: m/rad, by how much a length is too long for each radian of turning. curvature: (...) rad/m of the path, positive.
     """
     return np.asarray(np.clip(1 - slip * curvature, 0.0, 2.0))
 

@@ -1,6 +1,6 @@
-"""The keyframes and the rays of a log in map, corrected for many values of its shared errors at once.
+"""Correct the keyframes and the rays of a log for many values of its shared errors at once.
 
-A derivative needs the rays at two values of each error. Most of these values change only the mounts and the lenses of the
+A derivative needs the rays at two values of each error. Most of the values change only the mounts and the lenses of the
 cameras. So one computation for all values takes far less time than one computation for each.
 """
 
@@ -18,7 +18,7 @@ from objslam.frontend.corrected_log import refocused
 from objslam.frontend.localization.measured_poses import carried_by_odometry
 
 PLACE = ("x", "y", "z")
-"""The moves of a camera on the robot, along the axes of base."""
+"""The errors of a camera's place on the robot: moves along the axes of base."""
 
 
 def corrected_poses(
@@ -28,11 +28,12 @@ def corrected_poses(
     odometry_at: Callable[[Mapping[str, float], Floats], Floats],
     max_gap: float,
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the poses of keyframes (K), corrected for clocks and odometry, for M values of the shared errors by name.
+    """Return the poses of K keyframes, corrected for clocks and odometry, for M values of the shared errors.
 
-    odometry_at: returns the poses of the corrected odometry at stamps. max_gap: s, of the paths. Returns the stamps (M, K),
-    s, at which the poses are taken, all within the time of the path, map_T_base (M, K, 4, 4), and base_T_camera
-    (M, K, 4, 4), not yet corrected for the errors of mounts.
+    errors: M mappings from the name of an error to its value. odometry_at: returns the poses of the corrected odometry at
+    stamps. max_gap: s, the longest gap of a path that is bridged. Returns the stamps (M, K), s, at which the poses are
+    taken, all within the time of the path, map_T_base (M, K, 4, 4), and base_T_camera (M, K, 4, 4), not yet corrected for
+    the errors of mounts.
     """
     path, localization = log.robot_path, log.localization
     assert path is not None
@@ -68,8 +69,8 @@ def corrected_rays(
     """Return origins (M, R, 3), m, and unit directions (M, R, 3) of rays in map, and their noise (M, R), rad.
 
     map_T_base, base_T_camera: (M, K, 4, 4) of each keyframe, not yet corrected for the errors of mounts. camera: (K,) the
-    camera of each keyframe, as an index into `names`. rays: not yet corrected. errors: M values of the shared errors by
-    name. An absent name is 0.
+    camera of each keyframe, as an index into `names`. rays: not yet corrected. errors: M mappings from the name of an error
+    to its value. The value of an absent name is 0.
     """
     turn = rotation_from_vector(_of_cameras(errors, names, AXES))[:, camera]
     move = _of_cameras(errors, names, PLACE)[:, camera]

@@ -17,9 +17,9 @@ from objslam.frontend.odometry_bridge import bridge_of
 from objslam.frontend.odometry_drift import gathered_drift
 
 OFF_PATH = ("boxes before or after the", "boxes in a gap of the")
-"""The reasons for which boxes without a pose of the robot are dropped, without the name of the path."""
+"""The reasons to drop boxes without a pose of the robot. The name of the path follows each of them."""
 UNCOVERED = "boxes that the localisation does not cover"
-"""The reason for which a live session drops boxes at its end."""
+"""The reason for which a live session drops boxes at the end of the session."""
 _DIRECTIONS = 400
 """The number of directions in which the views of several cameras are compared. A larger number is more exact and slower."""
 
@@ -33,7 +33,7 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger, measured: Traj
     also counts frames outside of the stamps of its mount. LogError if the log has no path, no detection frame, or no frame
     on the path.
 
-    measured: the localisation before `continued_by_odometry`, if that continued it.
+    measured: the localisation before `continued_by_odometry` continued it, None if it was not continued.
     """
     path = log.robot_path
     if path is None:
@@ -111,9 +111,9 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger, measured: Traj
 def _overlap(log: Log, camera: Ints) -> float:
     """Return the share of the images of one moment that can show the same thing. camera: (K,) of each image.
 
-    For each direction that an image shows, take the share of all images that show it too, this image included. The result is
-    the mean of these shares over all images and directions. A direction stands for a point far away. A camera that moves on
-    the robot counts as if it were at its `base_T_camera`.
+    For each direction that an image shows, take the share of all images that show this direction, this image included. The
+    result is the mean of these shares over all images and directions. A direction stands for a point far away. A camera that
+    moves on the robot counts as if it were at its `base_T_camera`.
     """
     images = np.bincount(camera, minlength=len(log.cameras)) / len(camera)
     used = np.flatnonzero(images)
@@ -135,7 +135,8 @@ def with_mounts(frames: Keyframes, log: Log) -> Keyframes:
 
 
 def with_given_stamps(frames: Keyframes, log: Log) -> Keyframes:
-    """Return frames with their stamps in the log from which they were built. log: before any correction of its clocks."""
+    """Return frames with `given_stamps`, their stamps in a log. log: the log of the frames, before any correction of its
+    clocks."""
     stamps = frames.stamps.copy()
     for index, one in enumerate(log.cameras):
         mine = frames.camera == index

@@ -23,26 +23,26 @@ from objslam.frontend.surface_ranges import half_widths_of_rays, with_known_surf
 from objslam.io.calibration_yaml import load_calibration
 
 USUAL_PLACE = 0.05
-"""The prior standard deviation (m) of each axis of the place of a camera: a place that was measured with a ruler. With a
-larger value, a log must show more before an error counts as known."""
+"""The prior standard deviation (m) of the place of a camera along each axis. It fits a place that was measured with a ruler.
+With a larger value, a log must show more before an error counts as known."""
 _PLACE_BESIDE_ODOMETRY = 0.02
-"""In joint mode with localisation and odometry, this replaces `USUAL_PLACE`, because poses that may move can take up the
-effect of a wrong place. In a short live drive, the map was off by 4 cm with this value, and by 11 cm with `USUAL_PLACE`.
-Logs with places that were 1.5 cm off were as good with both."""
+"""The prior standard deviation (m) that replaces `USUAL_PLACE` in joint mode with localisation and odometry. There the poses
+may move, and so take up the effect of a wrong place. In a short live drive, the map was off by 4 cm with this value, and by
+11 cm with `USUAL_PLACE`. For logs with places that were 1.5 cm off, both values gave equally good maps."""
 USUAL_FOCAL = 0.02
 """The prior standard deviation of the focal length, as a share, if the field of view is from a data sheet. A calibrated
 camera errs less. The focal length is estimated only if a localisation or fixed mode gives poses. A path from odometry alone
-bends to fit a wrong focal length, and then a wrong association fits too: one of 36 parts of recorded drives had four
+bends to fit a wrong focal length, and then a wrong association also fits. One of 36 parts of recorded drives then had four
 landmarks twice. With a larger value, a log must show more before an error counts as known."""
 COARSE = 0.3
-"""Fixed poses with at least this noise, m, reveal no error of a camera. A robot at 1 to 2 m/s drives less than this during
+"""The least noise (m) of fixed poses that reveal no error of a camera. A robot at 1 to 2 m/s drives less than this during
 its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
 OF_LENGTHS = ("range_scale", "range_offset", "surface", "tag_scale")
 """The errors of measured lengths."""
 _OF_LONG_WAYS = ("odometry.turn_slip", "odometry.turn_per_m")
-"""The errors of wheels that short ways hardly show."""
+"""The errors of wheels that hardly show over short distances."""
 _CAMERA = ("clock", *AXES, *LENS, "x", "y", "z")
-# A run asks for one odometry many times.
+# Cached, because a run asks for one odometry many times.
 _in_plane = ValuesOfObjects[Trajectory, bool](lambda path: is_planar(path.poses))
 _sideways = ValuesOfObjects[Trajectory, bool](lambda path: CorrectablePath(path).drives_sideways)
 
@@ -66,7 +66,8 @@ def usual_place(log: Log, settings: Settings) -> float:
 
 
 def prior_sigma(name: str, settings: Settings, place: float) -> float:
-    """Return the prior standard deviation of an error in the settings, in the unit of the error, 0 if the error is fixed.
+    """Return the prior standard deviation of an error in the settings, in the unit of the error. It is 0 if the error is
+    fixed.
 
     In fixed mode, the errors are estimated from bearings and given poses. So errors of lengths and of odometry are fixed.
     place: what `usual_place` returns for the log, 0 for a map from odometry alone.
@@ -108,7 +109,7 @@ def possible(log: Log, settings: Settings) -> list[str]:
     position have no errors, unless settings.calibration.use is true. Its lens has no errors either, because such poses come
     from images of this lens, or were calibrated with it. Only odometry in the plane slips in curves, or has another scale
     sideways. Odometry in space comes from a camera or a scanner, not from wheels. With a localisation, odometry only leads
-    from one pose to the next. Such short ways hardly show a slip or the difference of two wheels. If these were free,
+    from one pose to the next. Such short ways hardly show a slip or the difference of two wheels. If these errors were free,
     wrong associations would fit.
     """
     asked, place = settings.calibration.use is True, usual_place(log, settings)
@@ -131,7 +132,7 @@ def has_sized_tags(rays: Rays, settings: Settings) -> bool:
 
 
 def measured_lengths(rays: Rays, half: Floats, settings: Settings) -> dict[str, bool]:
-    """Return by the name of each error of lengths whether any ray has it. half: (R,) as `surface_ranges.half_widths`."""
+    """Return for each name in `OF_LENGTHS` whether any ray has this error. half: (R,) as `surface_ranges.half_widths`."""
     ranged = np.isfinite(rays.range)
     some, surfaces = bool(ranged.any()), bool((ranged & (half > 0)).any())
     return dict(zip(OF_LENGTHS, (some, some, surfaces, has_sized_tags(rays, settings)), strict=True))
@@ -183,7 +184,7 @@ def _parts(log: Log) -> str:
 
 
 def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings) -> SharedErrors | None:
-    """Return the errors that are estimated from a log by the settings, None if there are none.
+    """Return the errors that the settings let a run estimate from a log, None if there are no such errors.
 
     keyframes, rays: of the solve. An error is a parameter if its prior sigma is not 0 and it affects a measurement.
     """

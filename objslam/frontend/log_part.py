@@ -13,7 +13,7 @@ from objslam.errors import LogError
 
 
 def part_of_log(log: Log, begin: float | None, end: float | None) -> Log:
-    """Return the part of a log from the stamp `begin`, s, to before the stamp `end`, s. None for no limit.
+    """Return the part of a log from the stamp `begin`, s, up to the stamp `end`, s, which is outside. None means no limit.
 
     The poses, images and boxes outside are left out. The objects of the truth stay. LogError if no pose, no
     pose of a moving camera, or no detection frame is inside.
@@ -66,7 +66,7 @@ def part_of_log(log: Log, begin: float | None, end: float | None) -> Log:
     if found.robot_path is None and log.robot_path is not None:
         raise _outside("pose", log, log.robot_path.stamps)
     for one, whole in zip(found.cameras, log.cameras, strict=True):
-        if whole.mount is not None and one.mount is None:  # Without its poses, it would pass for a camera that is fixed.
+        if whole.mount is not None and one.mount is None:  # Without poses, it would look like a fixed camera.
             raise _outside(f"pose of the camera {whole.camera.name}", log, whole.mount.stamps)
     stamps = [one.detections.frame_stamps for one in log.cameras if one.detections is not None]
     left = [one.detections.frame_stamps for one in found.cameras if one.detections is not None]
@@ -76,7 +76,8 @@ def part_of_log(log: Log, begin: float | None, end: float | None) -> Log:
 
 
 def part_in_words(part: tuple[float | None, float | None]) -> str:
-    """Return the limits of a part of a log in words: "from stamp 10.000 to 20.000 s". "" for a whole log."""
+    """Return the limits of a part of a log in words, such as "from stamp 10.000 to 20.000 s". The text is empty for a whole
+    log."""
     begin, end = part
     limits = ([] if begin is None else [f"from stamp {begin:.3f}"]) + ([] if end is None else [f"to stamp {end:.3f}"])
     return " ".join(limits).replace(" to stamp", " to") + " s" if limits else ""

@@ -1,9 +1,9 @@
 """How far a robot may be from its interpolated path, between two poses of its odometry.
 
-The interpolation assumes a constant velocity from pose to pose. A real robot changes its velocity in between, so it is
-elsewhere, except at the poses themselves. Such an error is a bridge. At the share s of a step, a random walk that is held at
-both ends has the variance `wander` * s * (1 - s). The odometry shows how large `wander` is: by how much the velocity changes
-from one step to the next.
+The interpolation assumes a constant velocity from pose to pose. A real robot changes its velocity in between, so it is on
+the interpolated path only at the poses themselves. The error in between is called a bridge. At the share s of a step, a
+random walk that is held at both ends has the variance `wander` * s * (1 - s). The odometry shows how large `wander` is: by
+how much the velocity changes from one step to the next.
 """
 
 from dataclasses import dataclass
@@ -17,9 +17,10 @@ from objslam.core.trajectory import Trajectory, usual_seconds
 from objslam.frontend.recent_values import ValuesOfObjects
 
 _SHARED = 1.0
-"""In the estimate for a step, the mean change of velocity on the whole path weighs as much as this number of changes. With a
-larger number, all steps wander more alike. With 0, a robot would never turn inside a step whose neighbours have its
-velocity. On simulated drives, errors reached six standard deviations with 0, and four with 1."""
+"""The weight of the mean change of velocity on the whole path, in the estimate for one step. The unit is the weight of one
+change of velocity beside the step. With a larger number, all steps wander more alike. With 0, a robot would never turn
+inside a step whose neighbours have its velocity. On simulated drives, the largest error was six standard deviations with 0,
+and four with 1."""
 
 
 @dataclass(frozen=True)
@@ -36,15 +37,16 @@ class OdometryBridge:
     def of(cls, odometry: Trajectory) -> Self:
         """Estimate the variance from the velocities in the steps of an odometry.
 
-        The mean velocities in two neighbouring steps of T and U seconds differ. If the velocity is white noise of density q,
-        their difference has the variance q (1 / T + 1 / U), and the path wanders by q T. If the velocity is a random walk of
-        density p, the variances are p (T + U) / 3 and p T^3 s^2 (1 - s)^2 / 3. Over a step, this second variance has the
+        Two neighbouring steps of T and U seconds have different mean velocities. If the velocity is white noise of density
+        q, their difference has the variance q (1 / T + 1 / U), and the path wanders by q T. If the velocity is a random walk
+        of density p, the variances are p (T + U) / 3 and p T^3 s^2 (1 - s)^2 / 3. Over a step, this second variance has the
         same mean as p T^3 / 15 * s (1 - s), which is used instead. Between a step and the next but one, white noise gives
         the same variance as between neighbours, and a random walk gives 2.5 times as much. This shows, for each axis, which
         share of the changes is a random walk.
 
-        Messages that waited come together. If they are stamped then, their steps take almost no time, and their velocities
-        mean nothing. So each change is also taken as if no step were shorter than usual, and the smaller change counts.
+        Messages that had to wait arrive together. If they are stamped at arrival, their steps seem to take almost no time,
+        and their velocities mean nothing. So each change is also taken as if no step were shorter than usual, and the
+        smaller change counts.
         """
         seconds = np.diff(odometry.stamps)[:, None]
         step = log_se3(inverse(odometry.poses[:-1]) @ odometry.poses[1:])
@@ -59,7 +61,7 @@ class OdometryBridge:
         """Return the places of stamps (K,), s, among the steps, and the variance (K, 6) of the step at each place.
 
         A place is the number of whole steps before the stamp, plus the share of the step in which the stamp lies. A stamp
-        beyond an end is at that end.
+        beyond an end of the path counts as that end.
         """
         last = len(self.stamps) - 1
         step = np.interp(stamps, self.stamps, np.arange(last + 1.0))
@@ -69,15 +71,16 @@ class OdometryBridge:
 
 
 bridge_of = ValuesOfObjects[Trajectory, OdometryBridge](OdometryBridge.of)
-"""What `OdometryBridge.of` returns. Several steps of a run need it for the same odometry."""
+"""`OdometryBridge.of` with kept results, because several steps of a run need it for the same odometry."""
 
 
 def _densities(step: Floats, seconds: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the squared changes of velocity from a step to the next (n-1, 6) and to the next but one (n-2, 6). Also return
-    two noise densities (n-1, 6) by the changes to the next step: if the velocity is white noise, and if it is a random walk.
+    two noise densities (n-1, 6) that the changes to the next step show: one if the velocity is white noise, and one if it is
+    a random walk.
 
-    step: (n, 6) twists. seconds: (n, 1) the time of each step. If there are only two steps, the changes to the next step are
-    returned for both.
+    step: (n, 6) twists. seconds: (n, 1) the time of each step. If there are only two steps, the changes to the next step
+    also replace those to the next but one.
     """
     velocity = step / seconds
     once = np.diff(velocity, axis=0) ** 2

@@ -15,7 +15,7 @@ Length = TypeVar("Length", float, Floats)
 
 
 def scaled_noise(settings: Settings, error: Mapping[str, float]) -> Settings:
-    """Return the settings with the odometry noise for distances that are longer by the share "odometry.scale" in `error`.
+    """Return the settings with the odometry noise for distances that are corrected by the error "odometry.scale".
 
     The noise of positions grows like the distances. Otherwise a map of another size would fit better or worse.
     """
@@ -53,7 +53,8 @@ class DriftPath:
 
     @classmethod
     def of(cls, odometry: Trajectory) -> Self:
-        """Measure the steps of the odometry. A step may leave out poses. Its length is then the length of the whole way."""
+        """Measure the steps of the odometry. If measured poses were left out of a step, its length is that of the whole way
+        through them."""
         poses = odometry.poses
         start, places = poses[0, :3, :3], (poses[:, :3, 3] - poses[0, :3, 3]) @ poses[0, :3, :3]
         up = start[:, 2] @ poses[:, :3, :3]
@@ -107,7 +108,7 @@ class PlanarSteps:
 
     @classmethod
     def between(cls, cos: Floats, sin: Floats, x: Floats, y: Floats) -> Self:
-        """Measure the steps between poses. A step is an arc."""
+        """Measure the steps between poses. Each step is taken to be an arc."""
         turn = np.abs(np.arctan2(sin[1:] * cos[:-1] - cos[1:] * sin[:-1], cos[1:] * cos[:-1] + sin[1:] * sin[:-1]))
         way = np.hypot(np.diff(x), np.diff(y)) / np.sinc(turn / (2 * np.pi))
         return cls(cos, sin, x, y, way, turn)
@@ -130,7 +131,7 @@ class PlanarSteps:
 
 
 def _weights(settings: Odometry) -> Floats:
-    """Return how (6, 14) the sums of `PlanarSteps` add to the six distinct elements of the drift, see `_PLANAR`."""
+    """Return the weights (6, 14) of the sums of `PlanarSteps` in the six distinct elements of the drift (`_PLANAR`)."""
     by_way, by_turn = (_step_variances(turn, way, settings) for turn, way in ((0.0, 1.0), (1.0, 0.0)))
     weights = np.zeros((6, 14))
     for first, (angle, _, _) in ((0, by_way), (6, by_turn)):

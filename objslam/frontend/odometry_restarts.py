@@ -1,4 +1,4 @@
-"""Recognise odometry that restarted in a gap: it counts from zero again."""
+"""Recognise odometry that restarted in a gap, so that its poses begin at zero again."""
 
 import numpy as np
 
@@ -6,14 +6,15 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.rotation import rotation_vector
 
 _ZERO = 0.05
-"""After a restart, the odometry is nearer to zero than this (m and rad). A larger value finds more restarts."""
+"""The largest distance (m) and angle (rad) of the odometry from zero after a restart. A larger value finds more restarts."""
 _FAR = 0.1
-"""Before a restart, the odometry was at least this far from zero (m or rad). Nearer, a restart changes little. A larger
-value finds fewer restarts."""
+"""The least distance (m) or angle (rad) of the odometry from zero before a restart. From a smaller one, a restart changes
+little. A larger value finds fewer restarts."""
 
 
 def counts_from_zero(before: Floats, after: Floats) -> Bools:
-    """Return whether odometry counts from zero again, for its poses (..., 4, 4) before and after a gap."""
+    """Return whether odometry begins at zero again after a gap. before, after: (..., 4, 4) its poses before and after the
+    gap."""
     return np.asarray((_from_zero(after) < _ZERO) & (_from_zero(before) > _FAR))
 
 

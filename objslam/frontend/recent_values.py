@@ -9,8 +9,8 @@ Thing = TypeVar("Thing")
 
 
 class ValuesOfObjects(Generic[Thing, Value]):
-    """The values of a function of objects that never change. A value is kept as long as its object lives, so it must not
-    refer to the object."""
+    """The values of a function of objects that never change. A value is kept as long as its object lives, so the value must
+    not refer to the object."""
 
     def __init__(self, compute: Callable[[Thing], Value]) -> None:
         """Keep the values of a function."""
@@ -18,7 +18,7 @@ class ValuesOfObjects(Generic[Thing, Value]):
         self._values: dict[int, Value] = {}
 
     def __call__(self, of: Thing) -> Value:
-        """Return the value of an object, computed if it is not kept."""
+        """Return the value of an object. It is computed if it is not kept."""
         key = id(of)
         if key not in self._values:
             self._values[key] = self._compute(of)
@@ -35,7 +35,7 @@ class RecentValues(Generic[Value]):
         self._values: dict[tuple[float, ...], Value] = {}
 
     def get(self, key: tuple[float, ...], compute: Callable[[], Value]) -> Value:
-        """Return the value of a key, computed if it is not kept. The least recently used value is dropped first."""
+        """Return the value of a key. It is computed if it is not kept. The least recently used value is dropped first."""
         found = self._values.pop(key) if key in self._values else compute()
         self._values[key] = found
         if len(self._values) > self._most:

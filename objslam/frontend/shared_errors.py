@@ -1,4 +1,4 @@
-"""The measurements of a log, corrected by its shared errors: the odometry's scale, clocks, and the cameras' rotations."""
+"""The measurements of a log, corrected by its shared errors, such as the odometry's scale, clocks and cameras' rotations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -35,15 +35,15 @@ noisy and change abruptly. The clocks of the MRCLAM robots converge in half the 
 _STEP = 0.01
 """The step of each parameter that is not in `_STEPS`, in its unit. The measurements are nearly linear over this step."""
 _MOST_SIGMAS = 6.0
-"""The bound of a parameter is the absolute value of its prior mean, plus this many standard deviations of its prior.
-MOST_SCALE bounds scales further. Clocks have their own bound. A larger value lets a parameter move farther from its
+"""The distance of a parameter's bound from the absolute value of the prior mean, in standard deviations of the prior.
+MOST_SCALE is a second bound of scales. Clocks have their own bound. A larger value lets a parameter move farther from its
 prior."""
 _LEAST = 0.1
 """The least measured range, as a share of the corrected range that it gives. With a larger share, more of the shortest
-ranges are longer than asked. Things that are farther than their offset of ranges never reach it."""
+ranges become longer than asked. The limit is never reached for things that are farther away than the offset of ranges."""
 _KEPT = 9
-"""For how many values of the errors the poses of the keyframes are kept. A larger number takes more memory. A round of
-derivatives needs seven."""
+"""The number of values of the errors for which the poses of the keyframes are kept. A larger number takes more memory. A
+round of derivatives needs seven."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class SharedErrors:
 
     @property
     def unknown_noise(self) -> frozenset[str]:
-        """The kinds of noise that are estimated, as `unknown_noise`."""
+        """The kinds of noise that are estimated, as the function `unknown_noise` returns them."""
         return unknown_noise(self.settings, self.log, self.keyframes, self.rays)
 
     @cached_property
@@ -94,15 +94,15 @@ class SharedErrors:
         return np.zeros(0) if self.log.odometry is None else self.log.odometry.stamps
 
     def with_noise(self, noise: NoiseFactors) -> Self:
-        """Return the same measurements with other noise. They share the kept poses, which do not depend on the noise."""
+        """Return the same measurements with other noise. Both share the kept poses, which do not depend on the noise."""
         return self._sharing_poses(replace(self, noise=noise))
 
     def with_rays(self, directions: Floats, ranges: Floats, values: Floats) -> Self:
-        """Return the same measurements with other directions (R, 3), unit, and ranges (R,), m, of the rays that `at` returns
-        at values (P,).
+        """Return the same measurements with other rays. At values (P,), `at` then returns these unit directions (R, 3) and
+        ranges (R,), m.
 
-        They share the kept poses, which do not depend on the rays. A range that an offset would make 0 or less stays
-        positive (`_LEAST`), so `at` returns a longer one there.
+        Both share the kept poses, which do not depend on the rays. A measured range that an offset would make 0 or less
+        stays positive (`_LEAST`). For such a range, `at` returns a longer one than asked.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
         lens, factors = self._lens(error), range_factors(error, self._half) * (1 + self.noise.shrinkage)
@@ -115,7 +115,7 @@ class SharedErrors:
         return other
 
     def with_paths_of(self, other: Self) -> Self:
-        """Return the same errors. They share the corrected paths that other errors of the same odometry have computed."""
+        """Return the same errors, which now share the corrected paths of `other` if both have the same odometry."""
         if self.log.odometry is not other.log.odometry:
             return self
         found = replace(self, _path=other._path)
@@ -159,7 +159,7 @@ class SharedErrors:
     def at(self, values: Floats, drift: bool = True) -> tuple[Keyframes, Rays, Settings]:
         """Return keyframes, rays and settings corrected by the errors (P,).
 
-        The noise of distances and ranges follows their scale. Otherwise a smaller map would fit better. The noise of
+        The noise of distances and ranges grows with their scale. Otherwise a smaller map would fit better. The noise of
         directions follows the lens for the same reason: with a longer focal length, all angles are smaller. Keyframes stay
         on their path. A stamp beyond an end of the path takes the pose of that end, and a stamp in a gap takes the nearest
         pose. drift: whether the drift is computed for the corrected odometry. If not, the drift and the variance of the
@@ -219,7 +219,7 @@ class SharedErrors:
         return take_out(self.log, dict(zip(self.names, values.tolist(), strict=True)), stay=True)
 
     def drift_at_stamps(self, keyframes: Keyframes, values: Floats) -> Keyframes:
-        """Return keyframes of `at`, with the drift at their own stamps.
+        """Return keyframes that `at` returned, with the drift at their own stamps.
 
         The clocks of several cameras can change the order of their frames. A graph keeps the order of the log, and needs
         a drift that grows in this order. Code that sorts keyframes by time needs a drift that grows with time.
@@ -231,7 +231,7 @@ class SharedErrors:
         return replace(keyframes, drift=drift)
 
     def with_prior(self, found: Calibration) -> Calibration:
-        """Return the calibration `found` with the prior of these errors."""
+        """Return the calibration `found` with the prior from before the solve."""
         return replace(found, prior_mean=self.mean, prior_covariance=self.prior)
 
     def take(self, keyframes: Keyframes, rays: Rays) -> Self:
@@ -259,7 +259,7 @@ class SharedErrors:
         return found
 
     def _sharing_poses(self, other: Self) -> Self:
-        """Return errors `other` of the same keyframes. They share the kept poses of these."""
+        """Return errors `other` of the same keyframes, which now share the kept poses of this object."""
         vars(other).update(_kept_poses=self._kept_poses, _kept_drift=self._kept_drift)
         return other
 
@@ -268,7 +268,7 @@ class SharedErrors:
         return np.array([lens_errors(error, name) for name in self.cameras])
 
     def _scaled_noise(self, error: Mapping[str, float]) -> Settings:
-        """The settings with the estimated noise, scaled like the odometry's distances."""
+        """The settings with the estimated noise. The odometry noise is scaled like the odometry's distances."""
         return scaled_noise(self.noise.settings(self.settings), error)
 
     def _poses(self, error: Mapping[str, float]) -> "_Poses":
@@ -312,7 +312,7 @@ class SharedErrors:
         return poses_near(path, stamps, self.settings.poses.max_gap)
 
     def _of_odometry(self, error: Mapping[str, float]) -> dict[str, float]:
-        """The errors of the odometry, which also correct its distances for the shrinkage of the map."""
+        """The errors of the odometry by name. Their scale also corrects the distances for the shrinkage of the map."""
         return dict(zip(ODOMETRY, self._odometry_key(error), strict=True))
 
     def _correctable(self) -> CorrectablePath:
@@ -337,7 +337,7 @@ class _Poses:
     """The poses (K, 4, 4) of K keyframes, corrected for the errors of clocks and odometry.
 
     stamps: (K,) s, of the images. known: (K,) s, at which the poses are taken, all within the time of the path.
-    base_T_camera: not yet corrected for the errors of the camera's rotation and place.
+    base_T_camera: not yet corrected for the errors of the cameras' rotations and places.
     """
 
     stamps: Floats

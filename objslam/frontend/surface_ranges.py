@@ -11,17 +11,19 @@ from objslam.core.camera import Camera, box_sizes
 from objslam.core.types import Keyframes, Rays
 
 _LEAST = 0.2
-"""The least ratio of a range to the distance of the centre. A smaller number lets boxes that fill the image move centres
-farther away."""
+"""The least ratio of the range of a surface to the distance of the centre behind it. With a smaller ratio, boxes that fill
+the image move centres farther away. It is also the least ratio of a range to the range before the correction of an
+offset."""
 
 
 def half_widths(
     box: Floats, direction: Floats, cameras: Sequence[Camera], camera: Ints, flat: np.ndarray | bool = False
 ) -> Floats:
-    """Return half the width (R,) of the thing in each box, in m per m of its distance.
+    """Return half the width (R,) of the thing in each box, in m per m of the thing's distance.
 
-    It is 0 for cameras whose boxes do not show sizes, and for things that are known to be flat. box: (R, 4) px. direction:
-    (R, 3) unit, in the camera frame. camera: (R,) number of its camera. flat: (R,) whether a thing is a fiducial.
+    The result is 0 for cameras whose boxes do not show sizes, and for things that are known to be flat. box: (R, 4) px.
+    direction: (R, 3) unit, in the camera frame. camera: (R,) the index of each box's camera in `cameras`. flat: (R,) whether
+    a thing is a fiducial.
     """
     sized = np.array([c.sees_size for c in cameras], dtype=bool)[camera]
     return np.where(sized & ~np.asarray(flat), box_sizes(box, direction, cameras, camera)[:, 0] / 2, 0.0)
@@ -60,9 +62,10 @@ def corrected_lengths(errors: Mapping[str, float], rays: Rays, half: Floats, lar
     """Return the ranges (R,), m, of rays, their standard deviations (R,) and those of their `range_bias` (R,), m, corrected
     for the shared errors.
 
-    Both standard deviations follow the ranges. Otherwise a smaller map would fit better.
+    Both standard deviations grow with the ranges. Otherwise a smaller map would fit better.
 
-    half: as `half_widths`. larger: the factor by which the map and its noise are larger.
+    half: as `half_widths`. larger: an additional factor on the ranges and on both standard deviations, by which the map is
+    enlarged.
     """
     factors = range_factors(errors, half) * larger
     ranges = corrected_ranges(errors, rays.range, rays.direction, factors)
@@ -70,7 +73,7 @@ def corrected_lengths(errors: Mapping[str, float], rays: Rays, half: Floats, lar
 
 
 def measured_ranges(errors: Mapping[str, float], ranges: Floats, direction: Floats, factors: Floats) -> Floats:
-    """Return ranges (R,), m, as they were before `corrected_ranges`, unless it limited them."""
+    """Return the ranges (R,), m, that `corrected_ranges` turned into `ranges`. Ranges that it limited are not restored."""
     offset = errors.get("range_offset", 0.0)
     return (ranges - offset / direction[:, 2]) / factors if offset else ranges / factors
 
@@ -92,9 +95,10 @@ def weights_of(rays: Rays) -> Floats | float:
 
 
 def with_known_surfaces(rays: Rays, half: Floats, sigma: float) -> Rays:
-    """Return the rays without the uncertainty that all things of a log share, because it is estimated.
+    """Return the rays without the error `surface` in their `range_bias`. All things of a log share this error, and it is
+    estimated.
 
-    half: (R,) as `half_widths`. sigma: the standard deviation of `surface` that is part of `Rays.range_bias`.
+    half: (R,) as `half_widths`. sigma: the standard deviation of `surface` that `Rays.range_bias` contains.
     """
     shared = sigma * half * rays.range
     return replace(rays, range_bias=np.sqrt(np.maximum(rays.range_bias**2 - np.nan_to_num(shared) ** 2, 0.0)))

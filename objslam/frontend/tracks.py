@@ -11,24 +11,26 @@ _LONGEST = 1.0
 thing, and the next box is not where the odometry expects it."""
 _NEAR = np.radians(6.0)
 """The largest angle (rad) between a ray and the ray before it in its track, turned by the odometry. A thing beside the robot
-moves by 5 degrees if the robot drives 8 % of its distance between the images. A larger angle joins neighbours more often."""
+moves by 5 degrees if the robot drives 8 % of the thing's distance between the images. A larger angle joins neighbours more
+often."""
 _MISS = 5.0
-"""The largest angle of a link by ranges, as a multiple of the median miss. The angle is at least `_LEAST_MISS` and at most
-`_NEAR`. A range shows where a thing is. So it is known how the thing shifts in the image as the robot drives, and rays of
-one track hardly miss each other. The median miss was 0.3 to 0.5 degrees in buildings, 0.9 on rough ground, and 2 for a robot
-that sways on its legs. Some recorded posts stand in groups, 17 cm apart. With a largest angle of 6 degrees, 27 % of the
-links joined neighbours there, and with 3 degrees 20 %. A larger multiple joins neighbours more often."""
+"""The largest angle of a link by ranges, as a multiple of the median angle by which linked rays miss each other (the miss).
+The angle is at least `_LEAST_MISS` and at most `_NEAR`. A range shows where a thing is, and so how it shifts in the image as
+the robot drives. So rays of one track hardly miss each other. The median miss was 0.3 to 0.5 degrees in buildings, 0.9 on
+rough ground, and 2 for a robot that sways on its legs. Some recorded posts stand in groups, 17 cm apart. Among them, 27 % of
+the links joined neighbours with a largest angle of 6 degrees, and 20 % with 3 degrees. A larger multiple joins neighbours
+more often."""
 _LEAST_MISS = np.radians(3.0)
-"""The largest angle (rad) of a link by ranges is at least this. Where wheels slip, rays miss each other by more than usual,
-and the tracks must go on there. With 2 degrees, the path of a simulated hotel was bent by 4 m at a slip, and with 3 degrees
+"""The lower limit (rad) of the largest angle of a link by ranges. Where wheels slip, rays miss each other by more than
+usual, but the tracks must go on. With 2 degrees, the path in a simulated hotel was bent by 4 m at a slip, and with 3 degrees
 by 0.2 m. A larger angle joins neighbours more often."""
 _BRIDGED = 0.5
 """The longest time (s) between two boxes of a track if the detector missed the thing between them. Ten robots were
-simulated. With 5 to 15 images a second, the bridge reduced the errors of clock and turns to a third. With 1 s and 2 images a
-second, these errors grew, because neighbours were joined."""
+simulated. With 5 to 15 images a second, bridged misses reduced the errors of clock and turns to a third. With 1 s and 2
+images a second, these errors grew, because neighbours were joined."""
 _IMAGES = 3
-"""The number of images before a ray in which its track may have its last ray. With 1, each missed box ends a track: of boxes
-that are missed in one of five images, tracks then have 5 rays on average. A larger number joins neighbours more often."""
+"""The number of earlier images in which the previous ray of a track is looked for. With 1, each missed box ends a track. If
+one box in five is missed, tracks then have 5 rays on average. A larger number joins neighbours more often."""
 FEWEST = 3
 """The fewest rays of a track. Two rays nearly always meet. With a larger number, fewer tracks are of use."""
 
@@ -40,7 +42,7 @@ def associate_tracks(keyframes: Keyframes, rays: Rays) -> Association:
     misses boxes. So a ray without a link is then compared with the image one further back, and so on. Linked rays are a
     track. Rays of shorter tracks have no object.
 
-    keyframes: with odometry, which predicts each ray in the next image.
+    keyframes: they must have odometry, which predicts each ray in the next image.
     """
     assert keyframes.odom_T_base is not None
     track, length = tracks_of_rays(keyframes, rays, keyframes.odom_T_base @ keyframes.base_T_camera)
@@ -55,12 +57,12 @@ def associate_tracks(keyframes: Keyframes, rays: Rays) -> Association:
 def tracks_of_rays(keyframes: Keyframes, rays: Rays, path_T_camera: Floats) -> tuple[Ints, Ints]:
     """Return the number (R,) of the track of each ray, and the number of rays of each track.
 
-    A ray that continues no track, and that no ray continues, is a track of its own. path_T_camera: (K, 4, 4) the poses of
-    the cameras in any frame, by odometry or solved.
+    A ray that is linked to no other ray is a track of its own. path_T_camera: (K, 4, 4) the poses of the cameras in any
+    frame, by odometry or solved.
     """
     origin, direction = rays.in_map(path_T_camera)
     root = np.arange(len(rays))
-    last, first = np.ones((2, len(rays)), dtype=bool)  # Whether a ray is the last of its track so far, and the first.
+    last, first = np.ones((2, len(rays)), dtype=bool)  # Is a ray the last, or the first, of its track so far?
     by_range = _NEAR
     for gap in range(1, _IMAGES + 1):
         one, two = _neighbours(keyframes, rays, gap)
@@ -87,12 +89,12 @@ def _mutual(one: Ints, two: Ints, angle: Floats, count: int) -> Bools:
 
 
 def _angles(origin: Floats, direction: Floats, range_m: Floats, one: Ints, two: Ints) -> tuple[Floats, Bools]:
-    """Return the angles (P,), rad, by which pairs of rays miss each other, and which of them count by a range (P,).
+    """Return the angles (P,), rad, by which pairs of rays miss each other, and which of them are from a range (P,).
 
-    Each ray of a pair with a range ends at a point, and the other ray misses it by an angle. If both have a range, the
-    smaller angle counts, because one range may be wrong. If none has one, the angle between the directions counts, which is
-    right for a thing far away. A thing that the robot passes moves on by many degrees between two images: of boxes on
-    shelves beside a robot, 31 % were linked to a neighbour without the ranges, and 2 % with them.
+    A ray with a range ends at a point, and the other ray of the pair misses this point by an angle. If both have a range,
+    the smaller angle counts, because one range may be wrong. If none has one, the angle between the directions counts, which
+    is right for a thing far away. A thing that the robot passes moves on by many degrees between two images. Of boxes on
+    shelves beside a robot, 31 % were linked to a neighbour without ranges, and 2 % with ranges.
 
     origin, direction: (R, 3) of the rays. range_m: (R,) m, NaN without one. one, two: (P,) the rays of each pair.
     """

@@ -1,4 +1,4 @@
-"""Find the clocks of cameras, and the order of their frames, before any map: at the right clock offset, bearings turn
+"""Find the clocks of cameras, and the order of their frames, before there is a map. At the right clock offset, bearings turn
 opposite to the robot."""
 
 from dataclasses import replace
@@ -13,32 +13,35 @@ from objslam.core.types import Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
 
 _STEP = 0.02
-"""The distance (s) between the tried offsets. A solve converges from ten times as far, so a smaller step is only slower."""
+"""The distance (s) between the tried offsets. A solve converges from ten times this distance, so a smaller step is only
+slower."""
 _LONGEST = 1.0
 """The longest time (s) between two bearings that are compared. Over a longer time, the robot drives past the object, and its
 bearing changes without a turn."""
 _MOST = 3000
 """The most pairs of bearings of a camera that are compared, spread over the log. A larger number is slower."""
 _SURE = 5.0
-"""The least log odds of a found offset against the expected offset. With a smaller value, robots that hardly turn begin at
-an offset that fits by chance. With a larger value, short drives begin at a wrong clock."""
+"""The least log odds of a found offset against the expected offset. With a smaller value, solves for robots that hardly turn
+begin at an offset that fits by chance. With a larger value, solves for short drives begin at a wrong clock."""
 _TRIGGER, _TRIGGERED = 0.01, 0.9
-"""Cameras have a common trigger if the stamps of at least `_TRIGGERED` of their images are within `_TRIGGER` (s) of the
-image before. Their images stay together, because found clocks err by more. A larger time, or a smaller share, takes more
-cameras for cameras with a trigger, whose frames stay in the order of their stamps."""
+"""The limits for cameras with a common trigger. At least the share `_TRIGGERED` of their images must follow the previous
+image within `_TRIGGER` (s). The first image of each moment does not count. These images stay together, because found clocks
+have larger errors. A larger time, or a smaller share, takes more cameras for cameras with a trigger, whose frames stay in
+the order of their stamps."""
 
 
 def clocks_of_turns(errors: SharedErrors) -> Floats:
-    """Return shared errors (P,) from which a search can begin: their mean, but with the clocks that the robot's turns show.
+    """Return shared errors (P,) from which a search can begin. They are the prior mean, with the clocks that the robot's
+    turns show.
 
     Two bearings of one label from neighbouring images differ by the turn of the robot between the images, and by parallax.
-    At the right offset, the turns in the bearings are nearest to the turns of the odometry. This offset is judged with the
-    prior of the clock, by Laplace's distribution of unknown width. A search that begins at a clock 0.2 s off can end at a
-    wrong optimum, where a large noise of turns explains what the clock causes.
+    At the right offset, the turns in the bearings are nearest to the turns of the odometry. The offsets are judged by the
+    prior of the clock and by Laplace's distribution of unknown width. A search that begins at a clock 0.2 s off can end at a
+    wrong optimum, where a large noise of turns explains the effect of the wrong clock.
 
     An interpolated pose has less noise midway between two poses of the odometry, because it averages the noise of both. If
-    the images come at the rate of the odometry, an offset of half a step would therefore fit better. So an offset does not
-    count as better by more than it would be if all that is missed were noise of the odometry.
+    the images come at the rate of the odometry, an offset of half a step would therefore fit better. So the mean angle at an
+    offset is raised by the factor by which the noise of the odometry alone would be smaller at this offset.
     """
     theta, odometry, cameras = errors.mean.copy(), errors.log.odometry, [one.camera.name for one in errors.log.cameras]
     if odometry is None or len(odometry) < 2 or errors.keyframes.odom_T_base is None:
@@ -65,12 +68,12 @@ def clocks_of_turns(errors: SharedErrors) -> Floats:
 
 
 def in_order_of_clocks(frames: Keyframes, rays: Rays, errors: SharedErrors | None) -> tuple[Keyframes, Rays]:
-    """Return frames, and rays with indices into them, in the order in which the images were taken.
+    """Return frames in the order in which the images were taken, and the rays with indices into these frames.
 
     Frames are in the order of their stamps. If the clocks of two cameras differ by more than the time between two frames,
     images that were taken one after the other change places. The path of a graph would then go to and fro, and each way
-    would count as a measurement of its own. errors: of these frames, None if no
-    clock is estimated. Images of cameras with a common trigger stay in the order of their stamps.
+    would count as a measurement of its own. Images of cameras with a common trigger stay in the order of their stamps.
+    errors: the shared errors of the frames, None if no clock is estimated.
     """
     cameras = () if errors is None else errors.cameras
     if errors is None or len(cameras) < 2:
@@ -90,7 +93,7 @@ def _pairs(errors: SharedErrors, camera: int) -> tuple[Floats, Floats, float]:
     """Return the stamps (n, 2), s, of pairs of bearings of one label, and the bearings (n, 2, 3), unit, in base.
 
     The last value is the number of independent pairs. It is smaller than n, because pairs of the same images share the turn,
-    and each image is compared with two others. Labels with several boxes in an image have no pairs there.
+    and each image is compared with two others. A label with several boxes in an image has no pairs in that image.
     """
     keyframes, rays = errors.keyframes, errors.rays
     mine = np.flatnonzero(keyframes.camera[rays.keyframe] == camera)
@@ -142,8 +145,7 @@ def _noise_of_turns(known: Floats, stamps: Floats, offsets: Floats) -> Floats:
 
 
 def _turned(known: Floats, rotations: Floats, stamps: Floats) -> Floats:
-    """Interpolate rotations (N, 3, 3) linearly. They are `known` at stamps (N,), s. Return them (n, 3, 3) at `stamps` (n,),
-    s.
+    """Return rotations (N, 3, 3), known at stamps `known` (N,), s, interpolated linearly at `stamps` (n,), s: (n, 3, 3).
 
     The result shortens vectors a little, which does not change their angles. This takes a tenth of the time of a rotation.
     """

@@ -9,8 +9,8 @@ from objslam.core.types import Keyframes, Log, Rays
 def unknown_noise(settings: Settings, log: Log, keyframes: Keyframes, rays: Rays) -> frozenset[str]:
     """Return the kinds of noise that are estimated: those that the settings allow, if the log has their measurements.
 
-    The set is empty in fixed mode. Without odometry, only the noise of the localisation is estimated. How long its errors
-    last is estimated even if the settings say how large they are.
+    The set is empty in fixed mode. Without odometry, only the noise of the localisation is estimated. The duration of the
+    localisation's errors is estimated even if the settings give their size.
     """
     default = Settings()
     if settings.mode != "joint":

@@ -16,19 +16,20 @@ _TILT = np.radians(45)
 """The angle, rad, between the mean of the up vectors and the map's z axis, above which the map lies on its side. Cameras on
 robots look up or down by less. With a larger angle, z is used more often."""
 _CLIMB = 2.0
-"""An axis does not point up if the cameras move along it this many times as far as along the map's z axis. Robots move
-mostly on the floor. A camera that looks straight down has a level up vector, which says nothing. With a larger number, the
-up vectors count in more maps."""
+"""The ratio of the cameras' motion along an axis to their motion along the map's z axis, above which the axis does not point
+up. Robots move mostly on the floor. A camera that looks straight down has a level up vector, which does not show where up
+is. With a larger number, the up vectors count in more maps."""
 _FROM_ABOVE = {"z": (0, 1), "-z": (1, 0), "x": (1, 2), "-x": (2, 1), "y": (2, 0), "-y": (0, 2)}
 """For each axis that can point up: the two axes that point to the right and to the top of a view from above. Together with
 the axis that points up, they are a right-handed frame."""
 
 
 def up_axis(keyframes: Keyframes) -> Up:
-    """Return the axis of the map that points up. It is z, unless the map lies on its side.
+    """Return the axis of the map that points up. This is z, unless the map lies on its side.
 
-    Then it is the axis that is nearest to the mean of the cameras' up vectors. The map of visual SLAM is often in the first
-    camera's frame, where y points down. If the path is planar, or the cameras move mostly along that axis, up is z.
+    For a map on its side, it is the axis that is nearest to the mean of the cameras' up vectors. The map of visual SLAM is
+    often in the first camera's frame, where y points down. If the path is planar, or the cameras move mostly along that
+    axis, up is z.
     """
     if not len(keyframes) or is_planar(keyframes.map_T_base):
         return "z"
@@ -44,7 +45,8 @@ def up_axis(keyframes: Keyframes) -> Up:
 
 
 def on_its_side(ups: Mapping[str, Up]) -> str | None:
-    """Return why maps cannot be matched, if one of them lies on its side. ups: the axis that points up, by name of map."""
+    """Return why maps cannot be matched, None if they can. A map on its side cannot. ups: the axis that points up, by name
+    of map."""
     for name, up in ups.items():
         if up != "z":
             return f"{name} lies on its side (up is {up}); maps are matched only with z up"
@@ -57,7 +59,7 @@ def from_above(up: Up) -> list[int]:
 
 
 def up_vector(up: Up) -> Floats:
-    """Return the unit vector (3,) of an axis."""
+    """Return the unit vector (3,) in map of the axis that points up."""
     return np.eye(3)["xyz".index(up[-1])] * (-1.0 if up.startswith("-") else 1.0)
 
 

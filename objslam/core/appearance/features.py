@@ -1,4 +1,4 @@
-"""Appearance vectors of boxes, such as the embedding of a network: unit vectors that are compared by their cosine."""
+"""Appearance vectors of boxes, such as the embeddings of a network. They are unit vectors, compared by their cosine."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,22 +11,22 @@ from numpy.typing import ArrayLike
 from objslam.core.arrays import Array, Bools, Floats32
 
 MAX_FEATURES = 8192
-"""The most numbers in an appearance vector. A larger bound accepts more wrong input, and needs more memory. No common image
-encoder has more than half of this number."""
+"""The most numbers in an appearance vector. A larger bound accepts more wrong input, and needs more memory. The vectors of
+common image encoders have at most half of this number."""
 _COMPACT = 64
 """The length to which long vectors are shortened in association. A larger number keeps finer differences, and is slower."""
 _SAMPLE = 20_000
 """The most vectors from which the directions of the shortened vectors are found. A larger number takes longer."""
 _ROUNDING = 1e-6
-"""A vector stays unchanged, bit by bit, if its length differs from 1 by at most this. A larger value leaves more vectors
-inexact. The length of a unit vector that was rounded to 32 bits differs by a tenth of this."""
+"""The largest difference from 1 in the length of a vector that stays unchanged, bit by bit. A larger value leaves more
+vectors inexact. The length of a unit vector that was rounded to 32 bits differs from 1 by a tenth of this."""
 _UNIT = 1e-3  # How far the length of a stored vector may be from 1. A larger value accepts worse vectors.
 
 
 @dataclass(frozen=True)
 class FeatureTable:
-    """The appearance vectors of the boxes of a log. vectors: (V, D) unit. Rays refer to its rows, so a selection of rays
-    copies no vectors."""
+    """The appearance vectors of the boxes of a log. vectors: (V, D), each of length 1. Rays store the index of their vector,
+    so a selection of rays copies no vectors."""
 
     vectors: Floats32
 
@@ -69,7 +69,8 @@ def are_unit_vectors(features: Floats32) -> bool:
 
 
 def short_numbers(vector: Floats32) -> list[float] | None:
-    """Return a vector (D,) as the shortest decimal numbers that are read back as the same floats; None if it is NaN."""
+    """Return a vector (D,) as the shortest decimal numbers that are read back as the same floats. None for a vector of
+    NaN."""
     return None if np.isnan(vector[0]) else [float(text) for text in vector.astype(str)]
 
 
@@ -88,8 +89,8 @@ def vector_of_entry(entry: Mapping[str, Any]) -> Floats32 | None:
 def ranked(vectors: Sequence[Floats32], query: ArrayLike, count: int) -> list[tuple[int, float]]:
     """Return the indices of the vectors (D,) with the largest cosines to a vector, and these cosines, the largest first.
 
-    Only vectors of the length of the query count. count: the most vectors to return. ValueError if the query is no vector or
-    cannot be scaled, or if no vector has its length.
+    A vector with another number of elements than the query is left out. count: the most vectors to return. ValueError if the
+    query is no vector or cannot be scaled, or if all vectors are left out.
     """
     given = np.asarray(query, dtype=np.float64)
     if given.ndim != 1 or not len(given):

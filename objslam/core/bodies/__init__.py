@@ -1,1 +1,1 @@
-"""The bodies of objects: shape, size and heading. Upright boxes, their footprints and their overlap belong to them."""
+"""The bodies of objects, which have a shape, a size and a heading, and the boxes around them."""

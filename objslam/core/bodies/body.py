@@ -21,10 +21,11 @@ half a turn."""
 class Body:
     """An upright body around the position of its object.
 
-    shape: `cuboid`, `cylinder`, `ellipsoid` or `sphere`. A cylinder may have an elliptic section. A sphere is taken if an
-    ellipsoid does not fit the boxes better. size: (3,) m, the full length, width and height. The length is the longer
-    horizontal side. yaw: rad in (-pi/2, pi/2], the direction of the length in the plane seen from above. size_sigma: (3,) m.
-    yaw_sigma: rad. It is at most `UNKNOWN_YAW`, which means that the yaw is unknown.
+    shape: `cuboid`, `cylinder`, `ellipsoid` or `sphere`. A cylinder may have an elliptic section. The shape is `sphere` if
+    an ellipsoid does not fit the boxes better. size: (3,) m, the full length, width and height. The length is the longer
+    horizontal side. yaw: rad in (-pi/2, pi/2], the direction of the length in the plane seen from above. size_sigma: (3,) m,
+    the standard deviations of the size. yaw_sigma: rad, the standard deviation of the yaw. Its largest value, `UNKNOWN_YAW`,
+    means that the yaw is unknown.
     """
 
     shape: Shape
@@ -43,8 +44,8 @@ def turned(body: Body, rotation: Floats) -> Body:
 @dataclass(frozen=True)
 class PlacedBody:
     """A body in a map. centre: (3,) m, None if the position from the object's rays is as good or better. covariance: (7, 7)
-    of the centre, the size and the yaw. behind: whether things hide parts of the body in many of its boxes. The object's
-    position is then this centre."""
+    of the centre, the size and the yaw, in m and rad. behind: whether other things hide parts of the body in many of its
+    boxes. If so, the object's position is this centre."""
 
     body: Body
     centre: Floats | None

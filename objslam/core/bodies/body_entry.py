@@ -26,7 +26,7 @@ def body_entry(body: Body) -> dict[str, Any]:
 
 
 def body_of_entry(entry: Mapping[str, Any]) -> Body | None:
-    """Return the body in the JSON entry of an object, None for a point. ValueError if it is malformed."""
+    """Return the body in the JSON entry of an object, None for a point. ValueError if the entry is malformed."""
     shape = next((one for one in SHAPES if one == entry.get("shape", "point")), None)
     if shape is None:
         raise ValueError(f"shape must be one of {', '.join(SHAPES)}, got {str(entry.get('shape'))[:60]!r}")
@@ -40,7 +40,7 @@ def body_of_entry(entry: Mapping[str, Any]) -> Body | None:
 
 
 def size_of(entry: Mapping[str, Any], name: str) -> Floats:
-    """Return the length, width and height (3,), m, under `name` in a JSON entry. ValueError if they are malformed."""
+    """Return the length, width and height (3,), m, under `name` in a JSON entry. ValueError if the value is malformed."""
     size: Any = entry.get(name)
     if not isinstance(size, list) or len(size) != 3 or not all(_finite(x) and 0 <= x < MAX_POSITION for x in size):
         raise ValueError(f"{name} must be a length, a width and a height in metres")

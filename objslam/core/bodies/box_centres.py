@@ -8,11 +8,13 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.body import SHAPES
 
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-"""The corners (8, 3) of a cuboid, in half axes."""
+"""The corners (8, 3) of a cuboid, in units of its half axes."""
 _RIMS = np.array([[np.cos(a), np.sin(a), z] for a in np.arange(16) * np.pi / 8 for z in (-1.0, 1.0)])
-"""Points (32, 3) on the two rims of a cylinder, in half axes. 16 points a rim miss its outermost point by at most 2 %."""
+"""Points (32, 3) on the two rims of a cylinder, in units of its half axes. A box around 16 points of a rim is too small by
+at most 2 %."""
 _OUTLINES = {SHAPES.index("cuboid"): _CORNERS, SHAPES.index("cylinder"): _RIMS}
-"""The points that the box of a shape goes around. The other shapes are ellipsoids, whose boxes have a closed form."""
+"""The points that the box of a shape goes around, by the index of the shape in `SHAPES`. The other shapes are ellipsoids,
+whose boxes have a closed form."""
 _NEAREST = 0.1
 """The least depth of the nearest part of a body, as a share of the depth of its centre. With a larger share, fewer bodies
 near the camera get a box."""
@@ -21,7 +23,7 @@ near the camera get a box."""
 def beside_centres(
     axes: Floats, to: Floats, half: Floats, yaw: Floats, shape: Ints, covariance: Floats
 ) -> tuple[Floats, Floats]:
-    """Return vectors from the centres of bodies to points on the rays through the centres of their boxes, and their noise.
+    """Return the vector from the centre of each body to a point on the ray through the centre of its box, and its noise.
 
     Let a camera with the axes x, y, z see an ellipsoid with the centre c and the matrix M of squared half axes. The left and
     the right edge of its box are planes with the normal n = x - u z that touch it: (n . c)^2 = n^T M n (Hartley and
@@ -29,7 +31,8 @@ def beside_centres(
     of a cuboid goes around the images of its corners. The box of a cylinder goes around the images of its rims. The vector
     is 0 for a body that reaches behind its camera.
 
-    The vectors (n, 3) are in m in map. Their standard deviations (n,), m, are along an axis of the image, to first order.
+    The vectors (n, 3) are in m in map. The noise (n,), m, is their standard deviation along an axis of the image, to first
+    order.
 
     axes: (n, 3, 3) the axes of the images in map, as columns: map_R_camera for a pinhole image. to: (n, 3) m, from the
     cameras to the centres. half: (n, 3) m, the half axes along the yaw, across it and upwards. yaw: (n,) rad. shape: (n,)
@@ -63,8 +66,8 @@ def beside_centres(
 def _around_points(points: Floats, centre: Floats, body: Floats, half: Floats) -> tuple[Floats, Floats]:
     """Return the vectors (n, 3) of `beside_centres` for boxes around points, and their derivatives (n, 3, 4).
 
-    Both are in the frame of the image.
-    points: (P, 3) in half axes. centre: (n, 3) m. body: (n, 3, 3) the axes of the bodies, as columns. half: (n, 3) m.
+    Both are in the frame of the image. points: (P, 3) in units of the half axes. centre: (n, 3) m. body: (n, 3, 3) the axes
+    of the bodies, as columns. half: (n, 3) m.
     """
     corner = centre[:, None] + points @ np.swapaxes(body * half[:, None], 1, 2)
     image = corner[:, :, :2] / corner[:, :, 2:]

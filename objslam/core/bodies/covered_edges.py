@@ -1,7 +1,7 @@
 """Edges of boxes along which another box of the same image begins.
 
-If thing A hides a part of thing B, the visible part of B ends along the outline of A. So the box of B ends at the box of A,
-or inside the half of it that is nearer to B.
+If thing A hides a part of thing B, the visible part of B ends along the outline of A. So the box of B ends at the edge of
+the box of A, or inside the half of that box that is nearer to B.
 """
 
 from __future__ import annotations
@@ -14,14 +14,16 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 
 _INSIDE = 0.5
-"""A thing in front leaves less than this share of the other box inside its own box. With more, the other thing is in front,
-or the two boxes are of one thing. A larger share finds more hidden edges, and more that are not."""
+"""The share of a box's area up to which another box that covers it may be of a thing in front. With a greater share inside,
+the other thing is in front, or the two boxes are of one thing. A larger share finds more hidden edges, and more that are
+not."""
 _PAIRS_AT_ONCE = 1 << 18
 """About the most pairs of boxes that are compared at once. A larger number needs more memory: 100 bytes a pair."""
 
 
 def pairs_in_images(image: Ints) -> Iterator[tuple[Ints, Ints]]:
-    """Yield the ordered pairs (P,) and (P,) of different boxes of one image, some at a time. image: (B,) of each box."""
+    """Yield the ordered pairs (P,) and (P,) of different boxes of one image, some at a time. image: (B,) the image of each
+    box."""
     order = np.argsort(image, kind="stable")
     end = np.searchsorted(image[order], image[order], side="right")
     left = end - np.arange(len(image)) - 1  # The number of later boxes of the image.
@@ -39,7 +41,7 @@ def covered_shares(box: Floats, front: Floats, noise: Floats) -> Floats:
     """Return for each edge of a box (P, 4), px, along which share (P, 4) of its length the box `front` (P, 4), px, may hide
     what is beyond the edge.
 
-    It is 0 for an edge that the other box does not reach, or does not go beyond. noise: (P,) px, the most by which two
+    The share is 0 for an edge that `front` does not reach, or does not go beyond. noise: (P,) px, the most by which two
     measurements of one edge differ.
     """
     low, high, near, far = box[:, :2], box[:, 2:], front[:, :2], front[:, 2:]

@@ -1,4 +1,4 @@
-"""The boxes of bodies that the image shows only a part of."""
+"""The boxes of bodies of which the image shows only a part."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Self

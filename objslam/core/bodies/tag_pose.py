@@ -22,9 +22,10 @@ class TagPose:
     """The rotation and the size of one fiducial. Its position is the position of its object.
 
     xyzw: (4,) the unit quaternion of map_R_tag: x from the first corner to the second, z from the tag to the viewer.
-    covariance: (3, 3) rad^2 of a rotation vector in the frame of the tag. size: m, the side. size_sigma: m, 0 for a given
-    size that counts as exact. other_xyzw: (4,) a second rotation at which a flat square looks nearly the same, None if the
-    views rule it out. other_probability: of this second rotation, 0 without one.
+    covariance: (3, 3) rad^2, of the error of the rotation as a rotation vector in the frame of the tag. size: m, the side.
+    size_sigma: m, its standard deviation, 0 for a given size that counts as exact. other_xyzw: (4,) a second rotation at
+    which a flat square looks nearly the same, None if the views rule it out. other_probability: the probability of the
+    second rotation, 0 without one.
     """
 
     xyzw: Floats

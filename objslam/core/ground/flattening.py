@@ -1,4 +1,4 @@
-"""A world that is flattened along z, in which rays with more noise up and down than to the sides have equal noise.
+"""A world that is flattened along z, so that rays from planar poses have equal noise in all directions.
 
 On uneven ground, planar poses lack roll, pitch and height. So rays have more noise up and down than to the sides.
 The map (x, y, z) -> (x, y, k z) keeps lines straight, so rays that meet in the world also meet in the flattened world.
@@ -11,7 +11,7 @@ from objslam.core.arrays import Floats
 from objslam.core.types import Rays
 
 LEVEL = 1.0
-"""The scale of a world that is not flattened."""
+"""The factor on z of a world that is not flattened."""
 
 
 def flattened_lines(origins: Floats, directions: Floats, scale: float) -> tuple[Floats, Floats, Floats]:
@@ -26,12 +26,12 @@ def flattened_lines(origins: Floats, directions: Floats, scale: float) -> tuple[
 
 
 def flattened_points(points: Floats, scale: float) -> Floats:
-    """Return points (..., 3) of the world in the flattened world."""
+    """Convert points (..., 3), m, from the world to the flattened world."""
     return points if scale == LEVEL else points * np.array([1.0, 1.0, scale])
 
 
 def raised_points(points: Floats, scale: float) -> Floats:
-    """Return points (..., 3) of the flattened world in the world."""
+    """Convert points (..., 3), m, from the flattened world to the world."""
     return points if scale == LEVEL else points / np.array([1.0, 1.0, scale])
 
 
@@ -42,9 +42,9 @@ def raised_covariances(covariances: Floats, scale: float) -> Floats:
 
 
 def noise_of_ground(settings: Settings) -> tuple[float, float]:
-    """Return the standard deviations of roll and of pitch, rad, and of the height, m, that planar poses lack.
+    """Return the standard deviation of roll and of pitch, rad, and that of the height, m. Planar poses lack all three.
 
-    Both are 0 if `planar` has its defaults. They describe a floor, which hardly moves a ray.
+    Both are 0 if `planar` in the settings has its defaults. The defaults describe a floor, which hardly moves a ray.
     """
     of = settings.planar
     return (0.0, 0.0) if of == type(of)() else (of.tilt, of.z)
@@ -53,7 +53,7 @@ def noise_of_ground(settings: Settings) -> tuple[float, float]:
 def flat_scale(rays: Rays, noise: tuple[float, float], settings: Settings) -> float:
     """Return the factor on z with which rays from planar poses have equal noise in all directions.
 
-    noise: of headings, rad, and of places, m.
+    noise: the standard deviations of headings, rad, and of places, m.
     """
     (yaw, place), (tilt, z) = noise, noise_of_ground(settings)
     angle = float(np.median(np.hypot(rays.sigma, yaw))) if len(rays) else 0.0

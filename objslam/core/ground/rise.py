@@ -1,4 +1,4 @@
-"""The rise of ground whose tilt lasts."""
+"""The rise of ground that keeps its tilt for some time."""
 
 import numpy as np
 
@@ -12,8 +12,9 @@ longer time cuts curves short."""
 def rise_of(stamps: Floats, poses: Floats, tilts: Floats, times: Floats) -> float:
     """Return the standard deviation (m) of the height of ground below a path.
 
-    Ground that tilts by an angle rises by this angle times the way. The whole path cannot rise over more than its own size.
-    No ray of an object that was seen in one place shows this height, because it lifts the object and the robot alike.
+    Ground that tilts by an angle rises by this angle times the way that the robot drives. The whole path cannot rise over
+    more than its own size. No ray of an object that was seen in one place shows this height, because it lifts the object and
+    the robot alike.
 
     stamps: (K,) s, and poses: (K, 4, 4), of the path. tilts: (n,) rad, the standard deviations of independent parts of the
     tilt, and times: (n,) s, how long each of them lasts.

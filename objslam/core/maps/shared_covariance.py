@@ -43,7 +43,7 @@ def shared_covariance(points: Floats, covariance: Floats, factor: Floats) -> Flo
     the best linear estimate (Gauss and Markov): once with this joint covariance, once with the blocks alone. The result is
     the covariance of the first estimate minus the covariance of the second. It is exact if all correlated errors are shifts,
     turns and sizes. Other correlated errors, such as bends of the path, then count as errors of the objects. The covariance
-    of each object is never below its part of the shared error.
+    of each object is never smaller than what the shared error adds to it.
     """
     if len(points) < _FEWEST or not factor.shape[2]:
         return None

@@ -1,4 +1,4 @@
-"""Find the points near a place, or in a box, without a look at each point (k-d tree)."""
+"""Find the points near a place or in a box with a k-d tree, which does not look at every point."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
 _SLACK = 1e-9
-"""The tree looks farther than asked, by this length (m) and by this share of the radius. Then the exact distances decide. A
-larger value covers more rounding, and asks for more points."""
+"""How much farther than asked the tree looks: this length (m), and this share of the radius. Then the exact distances
+decide. A larger value covers more rounding, and asks for more points."""
 
 
 class SpatialIndex:
@@ -35,7 +35,8 @@ class SpatialIndex:
         return self._trees[coordinates]
 
     def nearest(self, place: Floats) -> int | None:
-        """Return the index of the point nearest to a place, or of the first such point. None without any point."""
+        """Return the index of the point nearest to a place, or of the first of several such points. None if there are no
+        points."""
         if not len(self.finite):
             return None
         distance, _ = self._tree(len(place)).query(place)
@@ -79,7 +80,8 @@ def place_of(values: ArrayLike) -> Floats:
 
 
 def corners_of(low: ArrayLike, high: ArrayLike) -> tuple[Floats, Floats]:
-    """Return the corners of a box as arrays. A corner may be at infinity. ValueError if these are no corners of one box."""
+    """Return the corners of a box as arrays. A corner may be at infinity. ValueError if the two are no opposite corners of
+    one box."""
     lower, upper = _coordinates(low), _coordinates(high)
     if lower.shape != upper.shape:
         raise ValueError("both corners must have two coordinates, or both three")

@@ -1,1 +1,2 @@
-"""Find boxes of a log that show no thing of their own. Boxes that are wrong in themselves are those of `bearings`."""
+"""Find boxes of a log that show no thing of their own. `bearings` finds the boxes that are wrong by themselves, such as
+those with a low score."""

@@ -1,4 +1,4 @@
-"""Find boxes that a detector gives a second time to a part of a thing."""
+"""Find second boxes that a detector gives to a thing, around a part of the thing only."""
 
 import numpy as np
 
@@ -6,12 +6,12 @@ from objslam.core.arrays import Bools, Floats, Ints
 
 PARTS = "boxes inside another box of their label (parts of a thing)"
 _INSIDE = 0.9
-"""A box shows a part of the thing in another box only if at least this share of its area lies in the other box. With a
+"""The least share of a box's area inside another box, if the box shows only a part of the thing in that other box. With a
 smaller share, more boxes of neighbours that hide each other are dropped."""
 _AS_LARGE = 0.3
-"""A box may show a part of the thing in another box only if its area is at least this share of the area of the other box.
-The suppression of a detector leaves parts of about a half. A smaller box may show a second thing farther away. With a
-smaller share, more boxes are dropped."""
+"""The least area of a box that shows only a part of the thing in another box, as a share of the area of that other box. The
+suppression of a detector leaves parts with a share of about a half. A smaller box may show a second thing farther away. With
+a smaller share, more boxes are dropped."""
 _COMPARED = 32  # The most boxes of a label and frame that each box is compared with. A larger number takes longer.
 
 

@@ -21,29 +21,30 @@ from objslam.frontend.boxes.robot_parts import (
 )
 
 _PLACES = 16
-"""The most places of the image that are followed for each label. A place stays among them if more than one in 17 boxes of
-the label is there (Misra and Gries 1982). A larger number finds rarer boxes and takes longer."""
+"""The most places of the image that are followed for each label. A place is still followed if it has more than one in 17
+boxes of the label (Misra and Gries 1982). A larger number finds rarer boxes and takes longer."""
 _OF_WINDOW = 32
 """The most rays of a window that are kept. They are spread evenly. A larger number takes more memory."""
 _MOVED = np.cos(np.radians(1.0))
-"""A ray is kept if the camera has turned since the last kept ray by an angle with at most this cosine. A robot that waits
-adds none. A larger cosine keeps more rays."""
+"""The cosine of the angle by which the camera must turn after a kept ray before the next ray is kept. So a robot that waits
+adds no rays. A larger cosine keeps more rays."""
 _GAPS = 31
-"""The number of times between two boxes from which the usual time is taken. A larger number takes more memory."""
+"""The number of last gaps between two boxes from which the usual gap is taken. A larger number takes more memory."""
 _FORGOTTEN = 500
-"""A part of the robot is forgotten if so many frames of its camera do not show it. An arm may have moved away. With a larger
-number, boxes of things are dropped at its place for longer."""
+"""The number of frames after which a part of the robot is forgotten if none of them shows it. An arm may have moved away.
+With a larger number, boxes of things at the old place of the part are dropped for longer."""
 
 
 @dataclass
 class _Place:
-    """A place of the image where boxes of a label are. hits: the number of boxes there, less the number of times when a box
-    found no place. at, near: the numbers of boxes at the place, and near it. last: the last frame with a box there. ahead,
-    origin, direction: of the rays of the present window. open: those of the last `NEXT` windows whose rays meet until now:
-    the number of the window, and the origins and directions of the rays since its begin. missed, windows: how many windows
-    show that no thing at rest is there, and how many windows there were. latest: (4,) px, the last box. changes: how many
-    times two images in a row had a box here, and the sums of its changes and of their squares. gaps: the last numbers of
-    frames between two boxes.
+    """A place of the image where boxes of one label are. box: (4,) px, the mean of its first boxes. hits: the number of
+    boxes here, less the number of boxes of the label that found all places taken. at, near: the numbers of boxes at the
+    place, and near it. last: the last frame with a box here. ahead, origin, direction: the camera's axis, the origin and the
+    direction of each ray in the present window. open: the earlier windows, at most `NEXT`, whose rays still meet. Each has
+    its number, and the origins and directions of the rays since its start. missed: how many checks of windows showed no
+    thing at rest. windows: the number of windows. latest: (4,) px, the last box. changes: the number of changes of the box
+    from one image to the next, and the sums of the changes and of their squares. gaps: the last numbers of frames between
+    two boxes.
     """
 
     box: Floats
@@ -63,7 +64,7 @@ class _Place:
 
     @property
     def is_part(self) -> bool:
-        """Whether a part of the robot is there."""
+        """Whether the boxes of this place show a part of the robot."""
         enough = self.at >= FEWEST and self.at >= STEADY * self.near
         return enough and self.missed >= max(WINDOWS, AGREE * self.windows) and not drifts(*self.changes)
 
@@ -93,7 +94,7 @@ class _Place:
             self._keep(slice(None, None, 2))
 
     def _end_window(self) -> None:
-        """Count the window, and those windows before it whose rays met until now, but do not meet the rays of this one."""
+        """End the present window. Add to `missed` the windows, this one and open ones, whose rays do not meet."""
         self.windows += 1
         begun = [*self.open, (self.windows, [], [])]
         longer = [(first, origin + self.origin, direction + self.direction) for first, origin, direction in begun]
@@ -106,14 +107,14 @@ class _Place:
 
 
 class RobotPartFinder:
-    """Finds, frame by frame, which boxes of one camera are of parts of the robot."""
+    """Finds, frame by frame, which boxes of one camera show parts of the robot."""
 
     def __init__(self) -> None:
         self._places: dict[int, list[_Place]] = {}
         self._frame = 0
 
     def add(self, boxes: Floats, label: Ints, pose: Floats, direction: Floats) -> Bools:
-        """Add the boxes of a frame. Return which of them are of parts of the robot, (n,).
+        """Add the boxes of a frame. Return which of them show parts of the robot, (n,).
 
         boxes: (n, 4) px. label: (n,). pose: (4, 4) of the camera, in the frame of the odometry or the localisation.
         direction: (n, 3) of the rays of the boxes, in the frame of the camera.

@@ -1,6 +1,7 @@
 """Find boxes that stay at one place of the image while the camera turns, such as those of a part of the robot.
 
-No thing at rest stays there, unless the robot drives around it. Then its rays meet in front of the camera.
+A thing at rest stays at one place only if the robot drives around it. Then the rays of its boxes meet in front of the
+camera.
 """
 
 from collections.abc import Iterator
@@ -19,60 +20,60 @@ from objslam.core.trajectory import Trajectory
 from objslam.core.types import CameraLog, Detections, Log
 
 ROBOT_PARTS = "boxes that stay at one place of the image while the camera turns (a part of the robot; rays.robot_parts)"
-"""The reason to drop such boxes."""
+"""The reason to drop boxes of parts of the robot."""
 FEWEST = 20
 """The fewest boxes at one place of the image that may show a part of the robot. A larger number drops fewer boxes."""
 SAME_BOX, LIKE_BOX = 0.7, 0.3
 """Boxes are at one place of the image if their intersection over union with one box is above the first value. Boxes above
 the second value are near that place. With a larger first value, only steadier boxes are found."""
 STEADY = 0.5
-"""At least this share of the boxes near a place must be at the place. A part of the robot has a share of
-0.9 and more. Random boxes have ((1 - 0.7) / (1 - 0.3))^4 = 0.03 if their four coordinates are independent, and up to 0.1 if
-their sizes are similar. A larger share drops fewer boxes."""
+"""The least share of the boxes near a place that must be at the place. A part of the robot has a share of 0.9 and more.
+Random boxes have ((1 - 0.7) / (1 - 0.3))^4 = 0.03 if their four coordinates are independent, and up to 0.1 if their sizes
+are similar. A larger share drops fewer boxes."""
 _TENTHS = 6
-"""The boxes must be in at least this number of the tenths of the frames. A robot that waits, and a robot that follows
-somebody for a while, see boxes at one place in fewer. A larger number drops fewer boxes."""
+"""The frames are split into ten equal parts (tenths). The boxes of a place must be in at least this number of tenths. A
+robot that waits, or follows somebody for a while, sees boxes at one place in fewer tenths. A larger number drops fewer
+boxes."""
 _OFTEN = 0.1
-"""A tenth counts if at least this share of its frames has the box. A detector may miss a part of the robot in most images. A
-larger share drops fewer boxes."""
+"""The least share of the frames of a tenth that must have the box, so that the tenth counts. A detector may miss a part of
+the robot in most images. A larger share drops fewer boxes."""
 _TRIED, _COUNTED, _PLACES = 64, 4096, 16
-"""Limits of the search for the fullest place of the image, for each label and camera. Around at most `_TRIED` boxes, the
-near ones among at most `_COUNTED` boxes are counted. At most `_PLACES` places are tried. Larger numbers find rarer boxes,
-and take more time. The first two also take memory: without limits, 600,000 boxes of one label would take gigabytes."""
+"""Limits of the search for the image place with the most boxes, for each label and camera. For each place, at most `_TRIED`
+boxes are compared with at most `_COUNTED` boxes, to find the box with the most boxes around it. At most `_PLACES` places are
+tried. Larger numbers find rarer boxes, and take more time. The first two also take memory: without limits, 600,000 boxes of
+one label would take gigabytes."""
 TURN = np.radians(30.0)
 """The angle (rad) by which the camera turns in a window. Odometry is good over such a turn, and a thing at rest moves by
 much of the image. A larger angle needs more turning."""
 ABSENT = 10.0
-"""A window ends where the boxes are absent for more than this multiple of the usual time between two of them. A part of the
-robot stays while the camera turns. Things that the robot meets again on its way come and go. A larger number drops more
-boxes."""
+"""The gap between two boxes at which a window ends, as a multiple of the usual gap. A part of the robot stays while the
+camera turns. Things that the robot meets again on its way come and go. A larger number drops more boxes."""
 _MISSED = np.radians(5.0)
-"""A window shows that boxes are of no thing at rest if the point that fits their rays best is missed by more than this (rad,
-root mean square). Poses err by less over such a turn. If the camera turns in its place, rays of boxes that stay in the image
-miss the point by about 8.7 degrees (30 degrees / sqrt(12)). A larger angle drops fewer boxes."""
+"""The angle (rad, root mean square) by which rays miss the point that fits them best. A window with a larger angle shows no
+thing at rest. The errors of poses are smaller over such a turn. If the camera turns in its place, rays of boxes that stay in
+the image miss the point by about 8.7 degrees (30 degrees / sqrt(12)). A larger angle drops fewer boxes."""
 _BEHIND = 0.2
-"""A window also shows this if the point that fits best is behind the camera for more than this share of its rays. A larger
-share drops fewer boxes."""
+"""The share of the rays of a window for which the point that fits best is behind the camera. A window with a larger share
+shows no thing at rest. A larger share drops fewer boxes."""
 NEXT = 2
-"""The rays of a window are also compared together with those of up to this number of windows after it. Odometry is good over
-90 degrees too. With 1, the part of a robot whose curves change slowly stayed beside a camera that looks to the side. A
-larger number drops more boxes."""
+"""The most windows after a window whose rays are tested together with its own. Odometry is still good over the 90 degrees of
+three windows. With 1, a part of the robot was not found for a camera that looks to the side, because the curves of the robot
+changed slowly. A larger number drops more boxes."""
 _DRIFTING = 4.0
-"""Boxes drift if their mean change from one image to the next is more than this number of its standard deviations. A robot
-that drives along a row of equal things sees one thing after another at the same place of the image, and each grows or moves
-on. Boxes of a part of the robot change by noise alone. A larger number drops more boxes."""
+"""The mean change of boxes from one image to the next above which the boxes drift, in standard deviations of this mean. A
+robot that drives along a row of equal things sees one thing after another at the same place of the image, and each grows or
+moves on. Boxes of a part of the robot change by noise alone. A larger number drops more boxes."""
 WINDOWS, AGREE = 3, 0.8
-"""The first is the least number of windows that must show that boxes are of no thing at rest, and the second is the least
-share of all windows. Larger values drop fewer boxes. A window has at least two boxes, because rays of a part of the robot
-mostly meet behind the camera."""
+"""`WINDOWS` is the least number, and `AGREE` the least share, of the windows that must show no thing at rest. Larger values
+drop fewer boxes. Two boxes are enough for a window, because rays of a part of the robot mostly meet behind the camera."""
 
 
 def without_robot_parts(log: Log, settings: Settings, ledger: Ledger) -> Log:
-    """Return the log without boxes of parts of the robot. The ledger counts them.
+    """Return the log without the boxes of parts of the robot. The ledger counts the dropped boxes.
 
     A camera that moves on the robot keeps all boxes.
     """
-    path = log.odometry or log.localization  # Odometry does not jump.
+    path = log.odometry or log.localization  # The odometry first, because it does not jump.
     if path is None or not settings.rays.robot_parts:
         return log
     return replace(log, cameras=tuple(_cleaned(one, path, settings, ledger) for one in log.cameras))
@@ -173,7 +174,8 @@ def _any_between(values: Ints, low: int, high: int) -> bool:
 def _windows(ahead: Floats, breaks: Ints) -> Iterator[slice]:
     """Yield windows of boxes, in each of which the camera turns by `TURN`.
 
-    ahead: (M, 3) its direction at each box. breaks: the boxes before which there was none for long. No window contains one.
+    ahead: (M, 3) the direction of the camera's axis at each box. breaks: the boxes that follow a long time without a box. A
+    window never continues over a break.
     """
     for first, end in pairwise([0, *breaks.tolist(), len(ahead)]):
         while len(turned := np.flatnonzero(ahead[first:end] @ ahead[first] < np.cos(TURN))):

@@ -1,8 +1,8 @@
 """Find boxes that give the thing of another box a second label.
 
 A detector whose suppression works label by label may give a thing two boxes with different labels in one image, for example
-"potted plant" and "vase". The boxes are nearly equal. Two things may have nearly equal boxes too, from some places. So two
-labels count as labels of one thing only if most of their boxes that lie on each other are nearly equal.
+"potted plant" and "vase". The boxes are nearly equal. From some viewpoints, two things may also have nearly equal boxes. So
+two labels count as labels of one thing only if most of their boxes that lie on each other are nearly equal.
 """
 
 from collections import Counter
@@ -19,26 +19,28 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import CameraLog, Detections, Log
 
 SECOND_LABELS = "boxes on a surer box with another label (second labels of things; rays.second_labels)"
-"""The reason to drop such boxes."""
+"""The reason to drop boxes with second labels."""
 _NEARLY_EQUAL = 0.8
-"""Two boxes are nearly equal if their intersection over union is at least this. Equal boxes that are a ninth of their width
-apart have this value. Second boxes whose edges err by 2 % of their size have 0.85 and more. With a larger value, second
-labels with noisier edges become objects."""
+"""The least intersection over union of two nearly equal boxes. Equal boxes that are a ninth of their width apart have this
+value. Second boxes whose edges err by 2 % of their size have 0.85 and more. With a larger value, second labels with noisier
+edges become objects."""
 _MOST = 0.5
-"""Two labels are labels of one thing if at least this share of their boxes that lie on each other is nearly equal. Equally
-large boxes that pass each other sideways have a share of 0.22: they lie on each other from half a width on, and are nearly
-equal from a ninth on. In simulated rooms with second labels, pairs have 0.85 to 1, and pairs of true things at most 0.03. A
-larger share drops fewer boxes."""
+"""The least share of nearly equal boxes, among the boxes of two labels that lie on each other, if both are labels of one
+thing. Equally large boxes that pass each other sideways have a share of 0.22. They lie on each other if they are less than
+half a width apart, and are nearly equal if less than a ninth of a width apart. In simulated rooms with second labels, pairs
+of such labels have a share of 0.85 to 1, and pairs of labels of two things at most 0.03. A larger share drops fewer
+boxes."""
 _OTHERS = 5.0
-"""The share of the other pairs of labels counts as much as this number of boxes, because it shows what the detector does.
-Without other pairs, it also is the fewest nearly equal boxes that make two labels one thing. With a larger number, rare
-pairs follow the others more."""
+"""The weight, as a number of boxes, of the share of all other pairs of labels in the decision about one pair. That share
+shows what the detector does. Without other pairs, two labels need at least this number of nearly equal boxes to be labels of
+one thing. With a larger number, rare pairs follow the others more."""
 _STEPS = 8.0
-"""Boxes at one place of the image count once, so that a robot that waits shows nothing new. A place has this number of steps
-in the size of a box. A larger number tells more places apart, and a robot that waits counts more often."""
+"""The number of places of the image in the size of a box, along each axis. Boxes at one place count once, so that a robot
+that waits shows nothing new. A larger number tells more places apart, and the boxes of a robot that waits count more
+often."""
 _COMPARED = 64  # The most boxes of a frame that each box is compared with. A larger number takes longer.
 _MOST_PLACES = 20_000
-"""The most places that a session remembers, of all pairs of labels. Later ones do not count. A larger number takes more
+"""The most places that a session remembers, of all pairs of labels. Later places do not count. A larger number takes more
 memory."""
 
 
@@ -98,8 +100,8 @@ def without_second_labels(log: Log, settings: Settings, ledger: Ledger) -> Log:
 def pairs_on_each_other(boxes: Floats, frame: Ints, label: Ints, scores: Floats) -> Pairs:
     """Return the pairs of boxes (M, 4) px of one frame that lie on each other and have different labels.
 
-    The box with the higher score is the surer one. Of equal scores, it is that with the smaller label. frame, label, scores:
-    (M,) of the boxes.
+    The box with the higher score is the surer one. If the scores are equal, the box with the smaller label is the surer one.
+    frame, label, scores: (M,) of the boxes.
     """
     rank = np.empty(len(boxes), dtype=np.int64)
     rank[np.lexsort((label, -scores))] = np.arange(len(boxes))
@@ -124,8 +126,8 @@ def pairs_on_each_other(boxes: Floats, frame: Ints, label: Ints, scores: Floats)
 def labels_of_one_thing(same: Floats, near: Floats, every_same: float, every_near: float) -> Bools:
     """Return which pairs of labels (P,) are labels of one thing.
 
-    near: (P,) at how many places boxes of the two labels lie on each other. same: (P,) at how many they are nearly equal.
-    every_same, every_near: the sums over all pairs of labels.
+    near: (P,) the number of places at which boxes of the two labels lie on each other. same: (P,) the number of places at
+    which such boxes are nearly equal. every_same, every_near: the sums of both over all pairs of labels.
     """
     others = (every_same - same) / (every_near - near + _OTHERS)
     return np.asarray(same + _OTHERS * others >= _MOST * (near + _OTHERS))
@@ -133,7 +135,8 @@ def labels_of_one_thing(same: Floats, near: Floats, every_same: float, every_nea
 
 @dataclass
 class SecondLabelFinder:
-    """Finds, frame by frame, which boxes of a session give things second labels. It decides by what it has seen so far."""
+    """Finds, frame by frame, which boxes of a session give things second labels. The finder decides by the frames that it
+    has seen so far."""
 
     _seen: set[tuple[int, ...]] = field(default_factory=set)
     _near: Counter[tuple[int, int]] = field(default_factory=Counter)
@@ -142,10 +145,10 @@ class SecondLabelFinder:
     def add(self, camera: int, boxes: Floats, label: Ints, scores: Floats) -> tuple[Ints, Ints]:
         """Add a frame, and return the indices of its boxes with second labels (n,), and of the boxes below them (n,).
 
-        camera: its number. boxes: (M, 4) px. label, scores: (M,) of the boxes.
+        camera: the number of the camera. boxes: (M, 4) px. label, scores: (M,) of the boxes.
         """
         few = len(boxes) <= _COMPARED  # All pairs of 9,900 boxes took 7 s and gigabytes.
-        if few and not _lie_on_each_other(boxes, label):  # So it is in most frames, and this takes a tenth of the time.
+        if few and not _lie_on_each_other(boxes, label):  # True for most frames, and ten times as fast.
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
         pairs = pairs_on_each_other(boxes, np.zeros(len(boxes), dtype=np.int64), label, scores)
         for (a, b), equal, place in zip(pairs.labels.tolist(), pairs.equal.tolist(), pairs.place.tolist(), strict=True):
@@ -157,7 +160,8 @@ class SecondLabelFinder:
         return self._second(pairs)
 
     def second_boxes(self, boxes: Floats, frame: Ints, label: Ints, scores: Floats) -> tuple[Ints, Ints]:
-        """Return the same of boxes of several frames (M,), by what was seen so far. Nothing is added."""
+        """Return what `add` returns, for the boxes (M, 4) px of several frames, by what was seen so far. The frames are not
+        added. frame, label, scores: (M,) of the boxes."""
         return self._second(pairs_on_each_other(boxes, frame, label, scores))
 
     def _second(self, pairs: Pairs) -> tuple[Ints, Ints]:
@@ -190,7 +194,7 @@ def tells_labels(camera: Camera, whole: bool) -> bool:
 
 
 def _pairs_of(one: CameraLog, number: dict[str, int], settings: Settings) -> Pairs:
-    """Return the pairs among the usable boxes of a camera. number: of each label."""
+    """Return the pairs among the usable boxes of a camera. number: the number of each label."""
     found = one.detections
     assert found is not None
     usable = found.scores >= settings.rays.min_score
@@ -209,7 +213,7 @@ def _without_repeats(first: Ints, second: Ints) -> tuple[Ints, Ints]:
 
 
 def _without(found: Detections, first: Ints, second: Ints) -> tuple[Detections, Counter[tuple[str, str]]]:
-    """Return the detections without the second boxes of pairs, and the number of these boxes by their label and the label of
+    """Return the detections without the second boxes of pairs, and how many were left out, by their label and the label of
     the box below."""
     gone, below = _without_repeats(first, second)
     seconds = np.full(len(found), -1) if found.second is None else found.second.copy()

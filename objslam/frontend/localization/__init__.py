@@ -1,4 +1,4 @@
 """What a localisation measured: its jumps, its gaps, and which of its poses are measurements.
 
-The noise of a localisation and its factors do not live here. They are in `graph`.
+The noise of a localisation, and the factors of the graph for its poses, are in `graph`.
 """

@@ -1,8 +1,8 @@
 """Continue a localisation by the odometry, where the localisation has no poses.
 
 Many localisations begin later than the recording, end earlier, or pause. The odometry tells how the robot moved meanwhile,
-so a solve of the poses can use the boxes of these times too. The continued poses are where such a solve starts. They are no
-measurements.
+so a solve of the poses can also use the boxes of such times. The continued poses are the start values of such a solve. They
+are no measurements.
 """
 
 from dataclasses import replace
@@ -17,16 +17,17 @@ from objslam.core.types import Log
 from objslam.frontend.odometry_drift import gathered_drift
 
 _DRIFT = 0.15
-"""The largest standard deviation (rad) of the heading, by the settings of the odometry, that a continuation may gather. Rays
-of poses that drifted more are associated with wrong things. In MRCLAM drives that keep a part of their localisation, 0.2 rad
-gave 16 false objects in one drive, and 0.1 rad left out boxes that 0.15 rad uses. A larger value uses more boxes."""
+"""The largest standard deviation (rad) of the heading that a continuation may gather. The settings of the odometry give this
+standard deviation. Rays of poses that drifted more are associated with wrong things. In MRCLAM drives that keep a part of
+their localisation, 0.2 rad gave 16 false objects in one drive, and 0.1 rad left out boxes that 0.15 rad uses. A larger value
+uses more boxes."""
 _MOST = 0.5
-"""The largest share of the boxes that may lie on continued poses that no measurements enclose. If the odometry gives most
-poses, nothing shows the noise of the localisation, and the ellipsoids become too small. A larger share continues shorter
-localisations."""
+"""The largest share of the boxes that may lie on continued poses, except poses between two measured ones. If the odometry
+gives most poses, nothing shows the noise of the localisation, and the ellipsoids become too small. A larger share continues
+shorter localisations."""
 
 _LEAST = 0.5
-"""The boxes that a localisation has to cover, also with continued poses, as a share of those that the odometry covers. With
+"""The least share, of the boxes that the odometry covers, that a localisation with its continued poses must cover. With
 fewer, the odometry is used alone. At 2/3, an MRCLAM drive whose localisation begins after two fifths of the time lost its
 frame. With a larger share, fewer maps have the frame of the localisation."""
 
@@ -35,10 +36,10 @@ def continued_by_odometry(log: Log, settings: Settings, *, whole: bool = False) 
     """Return the log with a localisation that also has the poses of the odometry outside of its time and in its gaps.
 
     The continued poses join the localised poses at both ends of a gap. A gap of the odometry ends the continuation, because
-    somebody may have moved the robot in it. It also ends where the odometry has drifted too far. The log is returned
-    unchanged if there is nothing to continue, and if most boxes would lie outside of the localisation's time, or in gaps
-    that the odometry does not bridge (`bridged`). whole: whether to continue as far as the odometry goes, because the solve
-    starts at other poses.
+    somebody may have moved the robot in it. The continuation also ends where the odometry has drifted too far. The log is
+    returned unchanged if there is nothing to continue. It is also returned unchanged if more than the share `_MOST` of the
+    boxes would lie on continued poses that are not `bridged`. whole: whether to continue as far as the odometry goes,
+    without the limits of drift and `_MOST`, because the solve starts at other poses.
     """
     localization, odometry = log.localization, log.odometry
     if localization is None or odometry is None or not len(localization):
@@ -78,8 +79,9 @@ def without_short_localization(log: Log, settings: Settings) -> Log:
 
 
 def bridged(localization: Trajectory, odometry: Trajectory, stamps: Floats, settings: Settings) -> Bools:
-    """Return which stamps (Q,), s, lie between two poses of a localisation that the odometry joins without drifting too far.
-    The nearer one of the two measured the pose at such a stamp, and the odometry carried it there."""
+    """Return which stamps (Q,), s, lie between two poses of a localisation that the odometry joins to the stamp. The
+    odometry must drift little from at least one of the two. It carried the pose that was measured at the nearer one to the
+    stamp."""
     _, covered = interpolate(odometry.stamps, odometry.poses, localization.stamps, settings.poses.max_gap)
     known = localization.stamps[covered]
     if len(known) < 2 or not len(stamps):
@@ -135,10 +137,10 @@ def _between(poses: Floats, stamps: Floats, max_gap: float) -> Bools:
 
 
 def _near_localization(odometry: Trajectory, known: Floats, settings: Settings, drift: float) -> tuple[Bools, Floats]:
-    """Return which poses of an odometry (N,) drifted little since, or until, the nearest localised stamp (L,), s, without a
-    gap of the odometry in between. Also return the times (N,), s, at which the offset of the odometry from the map holds for
-    them. It is their own time between two localised stamps, unless one of the two lies beyond a gap or does not exist.
-    drift: rad, the largest.
+    """Return which poses of an odometry (N,) drifted little since the localised stamp before them, or until the one after.
+    Also return the times (N,), s, at which the offset between odometry and map is taken for each pose. Between two localised
+    stamps, this is the pose's own time. If only one of the two exists without a gap of the odometry in between, it is that
+    stamp. known: (L,) s, the localised stamps. drift: rad, the largest.
     """
     joined, sure, at = _ends(odometry, known, odometry.stamps, settings, drift)
     own = np.where(joined[0], known[at[0]], known[at[1]])
@@ -146,10 +148,12 @@ def _near_localization(odometry: Trajectory, known: Floats, settings: Settings, 
 
 
 def _ends(odometry: Trajectory, known: Floats, stamps: Floats, settings: Settings, most: float) -> tuple[Bools, Bools, Ints]:
-    """Compare stamps (Q,), s, with the localised stamps (L,), s, before and after them.
+    """Compare each of the stamps (Q,), s, with the localised stamp before it and the one after it. known: (L,) s, the
+    localised stamps.
 
-    most: rad, the largest drift. Returns for each of the two (2, Q): whether it exists without a gap of the odometry in
-    between, whether the odometry drifts little in between, and its index.
+    most: rad, the largest drift. Returns three arrays (2, Q), for the localised stamp before and the one after: whether it
+    exists without a gap of the odometry in between, whether the odometry also drifts little in between, and the index of the
+    localised stamp.
     """
     drift, at_known = np.split(
         gathered_drift(odometry, np.concatenate([stamps, known]), settings.odometry)[:, 2, 2], [len(stamps)]

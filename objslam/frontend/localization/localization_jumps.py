@@ -19,32 +19,32 @@ from objslam.core.trajectory import Trajectory, usual_seconds
 from objslam.core.types import Log
 
 ANOTHER_MAP = 1.0
-"""The longest jump (m) that is corrected. With a longer one, the localisation may have changed to another map, or somebody
-may have carried the robot. A larger value corrects longer jumps."""
+"""The longest jump (m) that is corrected. Before a longer jump, the localisation may have changed to another map, or
+somebody may have carried the robot. A larger value corrects longer jumps."""
 ACCELERATION = 5.0
-"""The acceleration (m/s^2) that a robot does not exceed from one step to the next and back. Wheels on a floor slip at 4 to
-8. With a larger value, fewer steps are jumps."""
+"""The highest acceleration (m/s^2) of a robot from one step to the next and back. Wheels on a floor slip at 4 to 8 m/s^2.
+With a larger value, fewer steps are jumps."""
 _FREE_ACCELERATION = 20.0
-"""The highest acceleration (m/s^2) of poses that are not in a plane: a hand swings a camera, and a drone flies, with up to 2
-g. With a larger value, fewer steps are jumps."""
+"""The highest acceleration (m/s^2) of poses that are not in a plane. Cameras in a hand and drones reach 2 g. With a larger
+value, fewer steps are jumps."""
 TIMES_ODD = 3.5
 """The least oddness of a jump, as a multiple of the oddness that a tenth of the steps exceeds. The oddness of a step is its
 difference from the steps beside it, or from the step of the odometry. For normal noise in a plane, 3.5 is 7.5 standard
 deviations. A larger number finds fewer jumps."""
 _CERTAIN = float(np.sqrt(27.6))
-"""The least size of a jump, in standard deviations. The standard deviation is for two poses and the odometry between them,
-by the settings. Noise exceeds this size with a probability of 1e-6 (chi-squared with 2 degrees of freedom), which is once in
-a thousand logs of a thousand poses. A smaller jump counts as noise. A larger number finds fewer jumps."""
+"""The least size of a jump, in standard deviations. This standard deviation is that of two poses and of the odometry between
+them, by the settings. Noise exceeds this size with a probability of 1e-6 (chi-squared, 2 degrees of freedom). This is once
+in a thousand logs of a thousand poses. A smaller jump counts as noise. A larger number finds fewer jumps."""
 _OF_MEDIAN = float(np.sqrt(np.log(10) / np.log(2)))
-"""The length that a tenth of the steps exceeds, as a multiple of their median length, for normal noise in a plane."""
+"""The length that a tenth of the steps exceeds for normal noise in a plane, as a multiple of the median length."""
 FEWEST_STEPS = 20
 """The fewest steps of a path that are judged. Fewer steps do not show what is usual."""
 _MOST_JUMPS = 10
 """The most jumps of a log. A localisation that jumps more often is a noisy one, and its noise is estimated. A larger number
 corrects worse localisations."""
 STILL = 1e-4
-"""Two poses that differ by less than this distance (m) and turn (rad) are one pose that was repeated. A larger value takes
-slow motion for a stop."""
+"""The distance (m) and the turn (rad) below which two poses are one pose that was repeated. A larger value takes slow motion
+for a stop."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Jumps:
 
     stamps: (J,) s, of the first pose after each jump. moves: (J, 3) m in map, and turns: (J, 3) rad, a rotation vector in
     map: by how much the path jumps. noise: (2, 3) the standard deviations of the coordinates of a move, m, and of a turn,
-    rad. shares: (J + 1,) of the time of the path: before the first jump, between two jumps, and after the last jump.
+    rad. shares: (J + 1,) the share of each part in the time of the path. The parts lie between the jumps.
     """
 
     stamps: Floats
@@ -88,16 +88,16 @@ class Jumps:
     def likely(self) -> Floats:
         """(J + 1,) the probability that each part is right, proportional to the root of its share of the time.
 
-        It lies between two assumptions. If a localisation were right at a random moment, a short part would hardly ever be
-        right. If each part were right with the same probability, a single wrong pose between two right parts would be right
-        with probability 1/3.
+        This probability lies between two assumptions. If a localisation were right at a random moment, a short part would
+        hardly ever be right. If each part were right with the same probability, a single wrong pose between two right parts
+        would be right with probability 1/3.
         """
         found = np.sqrt(self.shares)
         return found / found.sum()
 
     @property
     def sigma(self) -> float:
-        """The root mean squared distance, m, of the mean place from the part that is right."""
+        """The root mean square of the distance, m, between the mean place and the place of the right part."""
         return float(np.sqrt(self.likely @ ((self.offsets - self.middle[0]) ** 2).sum(axis=1)))
 
     def part(self, stamps: Floats) -> Ints:
@@ -113,10 +113,10 @@ class Jumps:
         return replace(path, poses=poses)
 
     def spread(self, stamps: Floats, origins: Floats, owner: Ints, positions: Floats) -> Floats:
-        """Return the errors that the jumps cause in the objects, as a factor (N, 3, m), m, of their joint covariance. There
-        are two causes. It is not known which part is right: if a part is right, which has its probability `likely`, all
-        objects are off by the distance of this part from the mean. The size of each jump has noise too: it moves an object
-        by the share of its rays that are beyond the jump.
+        """Return the errors that the jumps cause in the objects, as a factor (N, 3, m), m, of their joint covariance. The
+        errors have two causes. First, the right part is unknown. With the probability `likely` of a part, this part is
+        right, and all objects are off by its offset from the mean. Second, the size of each jump has noise. This noise moves
+        an object in proportion to the share of its rays beyond the jump.
 
         stamps: (R,) s, origins: (R, 3) m, owner: (R,) the object of each ray. positions: (N, 3) m of the objects.
         """
@@ -137,7 +137,7 @@ def find_jumps(log: Log, settings: Settings) -> Jumps | None:
     """Return the jumps of the localisation that can be corrected, None if there are none.
 
     The odometry shows the true steps if the log has it. Without it, a step is judged by the steps beside it. If there are
-    too many jumps, or one of more than `ANOTHER_MAP`, none can be corrected.
+    too many jumps, or if one is longer than `ANOTHER_MAP`, none can be corrected.
     """
     path = log.localization
     if path is None or settings.poses.jumps == "keep" or len(path) <= FEWEST_STEPS:
@@ -177,10 +177,10 @@ def _usual_corrections(off: Floats, usual: Floats) -> Floats:
 
     A particle filter follows the odometry, and corrects itself every few seconds. Most steps are then no corrections, so
     their oddness does not show how large corrections are. The largest of many corrections are not wrong, and without them
-    the path drifts as the odometry does. So a jump has to stand out from the corrections, too. A few corrections may all be
-    jumps.
+    the path drifts as the odometry does. So a jump must also stand out from the corrections. If there are few corrections,
+    all of them may be jumps, and the result is 0.
 
-    off: (N, 2) the oddness of steps, m and rad. usual: (2,) up to which oddness a step is no correction.
+    off: (N, 2) the oddness of steps, m and rad. usual: (2,) m and rad, the oddness up to which a step is no correction.
     """
     corrections = off[off[:, 0] > usual[0]]
     if len(corrections) <= _MOST_JUMPS:
@@ -218,11 +218,11 @@ def _by_odometry(path: Trajectory, odometry: Trajectory, max_gap: float) -> tupl
 
 
 def oddness(path: Trajectory) -> Floats:
-    """Return the oddness (N-1, 2) of the steps of a path, m and rad: the difference from the more similar of the two
+    """Return the oddness (N-1, 2) of the steps of a path, m and rad. It is the difference from the more similar of the two
     neighbouring steps.
 
-    The difference is found with the times as given, and with times that are not shorter than usual (`usual_seconds`). The
-    smaller difference counts.
+    The difference is computed twice: with the times of the steps as given, and with times that are not shorter than usual
+    (`usual_seconds`). The smaller difference counts.
     """
     seconds, steps = np.diff(path.stamps), steps_of(path.poses)
     return np.asarray(

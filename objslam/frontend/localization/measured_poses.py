@@ -1,8 +1,8 @@
 """Find which measurement of a localisation gave the pose of each keyframe.
 
-A localisation may be rarer than the images, as the poses of AMCL are. Or it follows the odometry between two corrections,
-as the transform of AMCL from map to odometry does. Then one measurement gives the poses of several keyframes, and they have
-one error, not one each. The odometry carries the measured pose to the keyframes.
+The poses of a localisation may be rarer than the images, as those of AMCL are. Or the localisation follows the odometry
+between two corrections, as the transform of AMCL from map to odometry does. In both cases, one measurement gives the poses
+of several keyframes. These poses share one error. The odometry carries the measured pose to the keyframes.
 """
 
 from collections.abc import Callable
@@ -21,15 +21,18 @@ from objslam.frontend.localization.continued_localization import beside, bridged
 from objslam.frontend.odometry_drift import gathered_drift
 
 _STEP = 1e-3
-"""A localisation was corrected once it moved by this more than the odometry (m, or rad). A larger value misses small
-corrections. A smaller value takes the rounding of poses and stamps for corrections. AMCL's corrections are centimetres."""
+"""The move (m) or turn (rad), beyond that of the odometry, by which a localisation shows that it was corrected. A larger
+value misses small corrections. A smaller value takes the rounding of poses and stamps for corrections. AMCL's corrections
+are centimetres."""
 _FEWEST, _MOST = 10, 0.5
-"""A localisation follows the odometry between corrections if it has at least `_FEWEST` corrections, and if at most the share
-`_MOST` of its poses are corrections. With fewer corrections, it is as exact as the odometry, or was made from it. A larger
-`_FEWEST` wants longer logs. A larger `_MOST` takes more localisations for ones that follow the odometry."""
+"""The least number of corrections, and the largest share of the poses that are corrections, if a localisation follows the
+odometry between corrections. With fewer corrections, a localisation is as exact as the odometry, or was made from the
+odometry. A larger `_FEWEST` needs longer logs. A larger `_MOST` takes more localisations for ones that follow the
+odometry."""
 _RARE = 1.2
-"""With more keyframes for each pose of the localisation, the odometry carries its poses to the keyframes. With fewer, poses
-are interpolated, which does not depend on the odometry. A larger number interpolates over longer times."""
+"""The number of keyframes for each pose of the localisation above which the odometry carries the poses to the keyframes.
+With fewer keyframes, poses are interpolated, which does not need the odometry. A larger number interpolates over longer
+times."""
 
 
 def with_measurements(keyframes: Keyframes, log: Log, measured: Trajectory, settings: Settings) -> Keyframes:
@@ -71,7 +74,7 @@ def with_measurements(keyframes: Keyframes, log: Log, measured: Trajectory, sett
 
 def _measured_at(localization: Trajectory, odometry: Trajectory, keyframes: Keyframes, max_gap: float) -> Floats | None:
     """Return the stamps (K,), s, of the measurements that gave the poses of keyframes. None if each pose was measured by
-    itself. A pose to which no odometry leads from a measurement counts as measured at its own stamp."""
+    itself. A pose counts as measured at its own stamp if no odometry leads to it from a measurement."""
     at, covered = interpolate(odometry.stamps, odometry.poses, localization.stamps, max_gap)
     stamps, known = keyframes.stamps, localization.stamps[covered]
     if len(known) < 2:
@@ -97,7 +100,7 @@ def _nearest(known: Floats, stamps: Floats) -> Floats:
 
 
 def _corrected(map_T_base: Floats, odom_T_base: Floats) -> Bools:
-    """Return which poses (n, 4, 4) of a localisation the odometry (n, 4, 4) does not explain by the pose before."""
+    """Return which poses (n, 4, 4) of a localisation do not follow from the pose before by the odometry (n, 4, 4)."""
     moved, by_odometry = (inverse(poses[:-1]) @ poses[1:] for poses in (map_T_base, odom_T_base))
     more = inverse(by_odometry) @ moved
     size = np.linalg.norm(more[:, :3, 3], axis=1) + np.linalg.norm(rotation_vector(more[:, :3, :3]), axis=1)
@@ -114,8 +117,9 @@ def carried_by_odometry(
 ) -> Floats:
     """Return poses (K, 4, 4) at stamps (K,), s, which the odometry carried from measurements of a localisation.
 
-    map_T_base: (K, 4, 4) the poses of keyframes that no measurement gave. localized_at: (K,) s, of the measurements, NaN if
-    there is none. on_odometry: returns the poses of the odometry at stamps. max_gap: s, the longest gap of the localisation.
+    map_T_base: (K, 4, 4), which stay for keyframes without a measurement. localized_at: (K,) s, the stamps of the
+    measurements, NaN without one. on_odometry: returns the poses of the odometry at stamps. max_gap: s, the longest gap of
+    the localisation.
     """
     known, result = np.isfinite(localized_at), map_T_base.copy()
     if not known.any():
@@ -128,10 +132,10 @@ def carried_by_odometry(
 
 def carried_variance(odom_T_base: Floats, drift: Floats, drift_at_measured: Floats) -> Floats:
     """Return the variances (K, 2), rad^2 and m^2, of heading and place that the odometry adds on its way from a measurement
-    to each keyframe. It is 0 without a measurement.
+    to each keyframe. The variances are 0 without a measurement.
 
     odom_T_base: (K, 4, 4). drift, drift_at_measured: (K, 6, 6) of the odometry at keyframes and at measurements, NaN at
-    keyframes without one.
+    keyframes without a measurement.
     """
     to_base = adjoint(inverse(odom_T_base))
     added = np.einsum("kij,kjl,kil->ki", to_base, drift - drift_at_measured, to_base)

@@ -1,8 +1,8 @@
-"""The clock of the odometry against that of the localisation, by the two paths alone.
+"""Find the offset between the clocks of odometry and localisation from the two paths alone.
 
-A localisation is often late by the time that it computes. An odometry from commanded velocities is early, because wheels
-follow a command late. So the two can be some tenths of a second apart. In a turn, a robot then seems to have two headings.
-At the right offset, both paths turn, start and stop at the same times.
+A localisation is often late by its computing time. An odometry from commanded velocities is early, because wheels follow a
+command late. So the two can be some tenths of a second apart. In a turn, a robot then seems to have two headings. At the
+right offset, both paths turn, start and stop at the same times.
 """
 
 from dataclasses import dataclass, replace
@@ -21,11 +21,11 @@ from objslam.core.types import Log
 from objslam.frontend.localization.localization_jumps import STILL, steps_of
 
 _TRIED = 0.04
-"""The distance (s) between the offsets that are tried first. A robot turns for longer, so the steps that follow converge. A
-larger distance is faster and may miss the best offset."""
+"""The distance (s) between the offsets that are tried first. Turns of robots last longer than this, so the fit converges
+from the best tried offset. A larger distance is faster and may miss the best offset."""
 _SPAN = 1.0
 """The least time (s) over which the two paths are compared. Over a shorter time, the noise of single poses hides a turn.
-Over a longer time, the drift of the odometry does. Turns of recorded robots last 1 to 4 s."""
+Over a longer time, the drift of the odometry hides it. Turns of recorded robots last 1 to 4 s."""
 _LONGEST = 10.0
 """The longest time (s) over which the paths are compared. Rare localisations have a pose each 2 to 10 s. A larger value
 compares paths between which the odometry has drifted more."""
@@ -35,43 +35,46 @@ _BLOCK = 5.0
 """The time (s) over which errors of the paths may be alike. The standard deviation comes from sums over such blocks. A
 larger value leaves fewer blocks, so it needs longer logs."""
 _FEWEST_BLOCKS = 5
-"""The fewest blocks in which the robot must turn, start or stop. Fewer do not show the standard deviation. A larger number
-leaves more short logs as they are."""
+"""The fewest blocks in which the robot must turn, start or stop. Fewer blocks do not show the standard deviation. A larger
+number leaves more short logs as they are."""
 _MOVING = 0.02
-"""A span shows the noise of the paths if the robot moves by this much in it (m or rad). A robot at rest has less noise. A
+"""The least motion (m or rad) of the robot in a span that shows the noise of the paths. A robot at rest has less noise. A
 larger value takes the noise from fewer spans."""
 _FINEST = 1e-3
-"""The least noise (m or rad) that two paths are taken to have. Two exact copies of a path would else have none, and nothing
-would be sure. A larger value counts exact paths less."""
+"""The least noise (m or rad) that two paths are taken to have. Without this limit, two exact copies of a path would have no
+noise, and the fit would have no result. A larger value gives exact paths less weight."""
 _UNEVEN = 0.003
-"""The standard deviation (s) of every offset, for a motion between two poses that is not as even as it is taken to be. In
-simulated drives with a pose each 2 s, this error was 3 to 6 ms. A larger value makes the standard deviation larger."""
+"""The standard deviation (s) that is added to that of every offset. The motion between two poses is taken to be even, but is
+not quite even. In simulated drives with a pose each 2 s, this error was 3 to 6 ms. A larger value makes the standard
+deviation larger."""
 _ROUNDS = 8
 """The most steps of the fit from the best offset that was tried. It usually needs four. A larger number is slower."""
 _LOOSE = np.array([1.0, 0.3, 0.3, 0.1, 0.1, 0.1])
 """The prior standard deviations of the offset (s), of the scales of turns and moves, and of the rates of turns (rad/s). They
-only keep the fit regular if a robot never moves. Larger values are looser."""
+only keep the fit regular if a robot never moves. Larger values hold the fit less."""
 _DELTA = 0.005
 """Half the time (s) over which the rate of a path is taken. A larger value blurs the rate, and a smaller one meets
 rounding."""
 _REPEATED = 0.01
-"""A localisation repeats the odometry if half of its steps differ by less than this share of a step. Rounding in a file
-makes a share of 1e-3, and an offset of 0.03 s in a turn makes 0.1. A larger value takes more localisations for copies."""
+"""The largest median difference between steps of a localisation and of the odometry, as a share of the step, at which the
+localisation repeats the odometry. Rounding in a file makes a share of 1e-3, and an offset of 0.03 s in a turn makes 0.1. A
+larger value takes more localisations for copies."""
 _HARMFUL = 0.03
 """The least offset (s) that is corrected. At 0.6 rad/s it turns the robot by 1 deg, which is as much as the noise of a
-localisation. Cameras have the same accuracy from their own clocks. A larger value leaves larger errors, a smaller one
+localisation. Cameras have the same accuracy from their own clocks. A larger value leaves larger errors. A smaller value
 changes logs in which nothing is wrong."""
 _CLEAR = 5.0
 """The least offset that is corrected, in its standard deviations. In simulated logs without an offset, offsets of up to 3
 standard deviations were found. A larger number corrects fewer logs."""
 _GAIN = 10.0
-"""The least gain in log likelihood of an offset that is corrected. The likelihood is Laplace's of unknown width, with one
-measurement for each span of time without overlap. A larger number corrects fewer logs."""
+"""The least gain in log likelihood of an offset that is corrected. The likelihood is that of Laplace's distribution with
+unknown width. Each span of time that overlaps no other counts as one measurement. A larger number corrects fewer logs."""
 
 
 @dataclass(frozen=True)
 class OdometryClock:
-    """offset: s, which the stamps of the odometry lack. It is positive if they are early. sigma: s, of the offset."""
+    """The clock of an odometry. offset: s, to be added to the stamps of the odometry. It is positive if these stamps are
+    early. sigma: s, the standard deviation of the offset."""
 
     offset: float
     sigma: float
@@ -82,10 +85,11 @@ class OdometryClock:
 
 
 def at_one_clock(log: Log, settings: Settings, ledger: Ledger) -> tuple[Log, OdometryClock | None]:
-    """Return the log with the stamps of its odometry at the clock of its localisation, and what was corrected.
+    """Return the log with the stamps of its odometry in the clock of its localisation, and the corrected clock.
 
-    The localisation keeps its stamps, because the clocks of cameras are estimated against it. The log is returned as it is,
-    with None, if the offset is not clearly harmful, or if the settings keep the stamps. The ledger gets a warning else.
+    The localisation keeps its stamps, because the clocks of cameras are estimated against it. If the offset is not clearly
+    harmful, or the settings keep the stamps, the log is returned unchanged, with None. If the stamps are corrected, the
+    ledger gets a warning.
     """
     found = _found(log, settings)
     if found is None or log.odometry is None:
@@ -146,11 +150,12 @@ def clock_of_odometry(
 
 @dataclass(frozen=True)
 class _Way:
-    """How far a path has turned and gone since its start, as its base felt it. So the frames of two paths need not agree.
+    """How far a path has turned and moved since its start, in the frame of base. So the map frames of two paths need not
+    agree.
 
     stamps: (N,) s. felt: (N, 6) the sums of the turns, rad, and of the moves, m, in base. area: (N, 6) the integral of
-    `felt` over the time. width: s, over which `felt` is averaged. The noise of a pose between two measured ones is smaller
-    than that of a measured one, so without an average, an offset by half a step would fit noise better.
+    `felt` over the time. width: s, over which `felt` is averaged. An interpolated pose between two measured poses has less
+    noise than a measured one. So without the average, an offset of half a step would fit better.
     """
 
     stamps: Floats
@@ -182,7 +187,8 @@ class _Way:
 
 @dataclass(frozen=True)
 class _Fit:
-    """offset, sigma: s, of the clock. cost: the negative log likelihood by Laplace's distribution."""
+    """The fit of a clock. offset, sigma: s, the offset and its standard deviation. cost: the negative log likelihood by
+    Laplace's distribution."""
 
     offset: float
     sigma: float
@@ -193,8 +199,8 @@ class _Fit:
 class _Spans:
     """Spans of time over which a localisation and an odometry are compared.
 
-    begin, end: (n,) s. told: (n, 6) what the localisation felt in each. odometry: its way. kinds: the columns that are
-    compared, turns and moves.
+    begin, end: (n,) s. told: (n, 6) the turn and the move of the localisation in each span, as in `_Way.felt`. odometry: the
+    way of the odometry. kinds: the columns that are compared, turns and moves.
     """
 
     begin: Floats
@@ -232,7 +238,7 @@ class _Spans:
         return cls(stamps[begin], stamps[end], felt[end] - felt[begin], way, kinds)
 
     def by_odometry(self, offset: float) -> Floats:
-        """Return what the odometry felt (n, 6) in each span, if `offset`, s, is added to its stamps."""
+        """Return the turn and the move (n, 6) of the odometry in each span, if `offset`, s, is added to its stamps."""
         return self.odometry.at(self.end - offset) - self.odometry.at(self.begin - offset)
 
     def missed(self, offset: float) -> list[Floats]:
@@ -241,9 +247,10 @@ class _Spans:
         return [lengths(off[:, kind]) for kind in self.kinds]
 
     def fitted(self, offset: float, *, free: bool) -> _Fit | None:
-        """Fit the offset, s, and what else the odometry does wrong at all times. None if the spans do not show them.
+        """Fit the offset and the lasting errors of the odometry, which are two scales and a rate of turns. None if the spans
+        do not show them.
 
-        offset: s, at which the fit begins. free: whether the offset is fitted too.
+        offset: s, at which the fit begins. free: whether the offset is fitted. If not, it is held.
         """
         seconds = self.end - self.begin
         errors = np.array([offset, 0.0, 0.0, 0.0, 0.0, 0.0])  # The offset, two scales and the rate of turns (3,).
@@ -277,8 +284,8 @@ class _Spans:
         return _Fit(float(errors[0]), float(np.sqrt(variance)), float(cost))
 
     def _linear(self, errors: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return what the two paths differ by (n, 6) at errors (6,) of the odometry. Also return by how much the errors
-        change the odometry (n, 6, 6), and the weights (n, 6)."""
+        """Return the differences (n, 6) between the two paths at errors (6,) of the odometry. Also return by how much the
+        errors change the odometry (n, 6, 6), and the weights (n, 6)."""
         seconds, driven = self.end - self.begin, self.by_odometry(errors[0])
         scale = 1 + np.repeat(errors[1:3], 3)
         seen = scale * driven
@@ -295,7 +302,8 @@ class _Spans:
 
 
 def _unwrapped(off: Floats) -> Floats:
-    """Return differences (n, 6) with turns of half a turn at most. Between rare poses, a robot turns by more than that."""
+    """Return differences (n, 6) whose turns are reduced to at most half a turn. Between rare poses, a robot may turn by more
+    than that."""
     angle = lengths(off[:, :3])
     less = angle - 2 * np.pi * np.round(angle / (2 * np.pi))
     off = off.copy()
@@ -304,14 +312,15 @@ def _unwrapped(off: Floats) -> Floats:
 
 
 def _weights(missed: Floats, driven: Floats) -> Floats:
-    """Return Huber's weights (n,) of spans that miss by `missed` (n,), of which the odometry drives `driven` (n,)."""
+    """Return Huber's weights (n,) of spans. missed: (n,) how far the paths differ in each span. driven: (n,) how far the
+    odometry moves in each span."""
     moving = missed[driven > _MOVING]
     noise = max(float(np.median(moving)) / NORMAL_MEDIAN if len(moving) else 0.0, _FINEST)
     return np.asarray(np.minimum(1.0, HUBER_K * noise / np.maximum(missed, 1e-12)) / noise**2)
 
 
 def _repeats(odometry: Trajectory, localization: Trajectory, max_gap: float) -> bool:
-    """Return whether a localisation repeats the steps of the odometry, as that of a particle filter on /tf does between two
+    """Return whether a localisation repeats the steps of the odometry. A particle filter on /tf does so between two
     corrections. Then both have one clock. The corrections come after the errors that they correct, so they look late."""
     at, covered = interpolate(odometry.stamps, odometry.poses, localization.stamps, max_gap)
     step, driven = (log_se3(inverse(path[:-1]) @ path[1:]) for path in (localization.poses[covered], at[covered]))
@@ -321,5 +330,6 @@ def _repeats(odometry: Trajectory, localization: Trajectory, max_gap: float) -> 
 
 
 def _width(missed: Floats) -> float:
-    """Return the log of Laplace's width of what is missed (n,), which a few jumps hardly change."""
+    """Return the logarithm of the width of Laplace's distribution for the differences `missed` (n,). A few jumps hardly
+    change it."""
     return float(np.log(np.minimum(missed, 20 * np.median(missed) + _FINEST).mean() + _FINEST))
