@@ -1,4 +1,4 @@
-"""Names of numbered classes for the boxes of a running robot, before its session gets them."""
+"""Replaces the class numbers of a running robot's boxes by names, before the session receives the boxes."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -10,14 +10,14 @@ from objslam.live.counters import Counters
 from objslam.live.interface import Sink
 
 UNNAMED = "boxes with a class number that has no name"
-"""The event that is counted for a box whose number stays."""
+"""The name of the event that is counted for each box whose label stays a number."""
 
 
 class NamedSink:
     """A `Sink` that hands all messages to another sink, with names in place of labels that are numbers.
 
-    given: the names, as `load_names` takes them. counters: count boxes whose number has no name, and warn of the first one.
-    ConfigError as in `load_names`.
+    sink: the other sink. given: the names, as `load_names` takes them. counters: counts the boxes whose number has no name.
+    The user is warned of the first such box. Raises ConfigError as `load_names` does.
     """
 
     def __init__(self, sink: Sink, given: str, counters: Counters) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from objslam.core.diagnostics import Ledger
 from objslam.sources.journal.records import FrameMessage
 
-_WINDOW = 2000  # How many of the newest update times make the percentiles. With a larger number, they react more slowly.
+_WINDOW = 2000  # The number of newest update times in `Counters.update`. With a larger number, its result reacts later.
 
 
 class _Guarded(Ledger):

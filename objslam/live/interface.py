@@ -20,7 +20,7 @@ class Sink(Protocol):
         """Push a calibrated camera. Its base_T_camera is valid until `push_mount` replaces it."""
 
     def push_odometry(self, stamp: float, odom_T_base: Floats, covariance: Floats | None = None) -> bool:
-        """Push odom_T_base (4, 4) at a stamp, s. covariance: (6, 6), as in ROS, of x, y, z, roll, pitch, yaw."""
+        """Push odom_T_base (4, 4) at a stamp, s. covariance: (6, 6) of x, y, z (m) and roll, pitch, yaw (rad), as in ROS."""
 
     def push_localization(self, stamp: float, map_T_base: Floats, covariance: Floats | None = None) -> bool:
         """Push map_T_base (4, 4) of a localisation at a stamp, s. covariance: as in `push_odometry`."""

@@ -1,5 +1,5 @@
-"""Slow work on the whole map of a running session. It is done in rounds: a process beside the session does the work, and
-then its answer corrects the map."""
+"""Slow work on the whole map of a running session. It is done in rounds. In each round, a separate process does the work,
+and then its answer corrects the map."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ Told = TypeVar("Told", bound=Correction)
 
 
 class Rounds(ABC, Generic[Answer, Told]):
-    """Decides after each keyframe whether a round begins, or corrects the map.
+    """Decides after each keyframe whether a round begins, and whether the last round corrects the map.
 
-    A round begins when the number of keyframes has grown by `growth` since the last one began. So the time of all rounds is
-    proportional to the number of keyframes. The map is corrected when the number has grown by `delay` since the round began.
-    Both wait for a keyframe without other tasks (`is_quiet`).
-    If the process is done by then, the map does not depend on the machine's speed. If it is late, a `patient` session waits
-    for it, and any other session goes on. The journal receives each correction with its keyframe. So a resumed session
-    corrects its map at the same keyframe.
+    A round begins when the number of keyframes has grown by the factor `growth` since the last round began. So the time of
+    all rounds is proportional to the number of keyframes. The map is corrected when the number has grown by the share
+    `delay` since the round began. Both steps wait for a keyframe without other tasks (`is_quiet`). If the process is done by
+    then, the map does not depend on the machine's speed. If it is late, a `patient` session waits for it, and any other
+    session goes on. The journal receives each correction with its keyframe. So a resumed session corrects its map at the
+    same keyframe.
     """
 
     growth: float
     delay: float
     quick: bool
-    """Whether a round takes less time than the start of a process. Then a patient session does the work itself, and any
-    other session keeps its process running."""
+    """Whether a round takes less time than the start of a process. If so, a patient session does the work without a process,
+    and any other session keeps its process running."""
     told: type[Told]
-    """The kind of its corrections."""
+    """The class of the corrections."""
 
     def __init__(self, mapper: Mapper, record: Callable[[Told], bool], first: int, patient: bool) -> None:
-        """Prepare for a session. record: writes a correction to the journal, and returns whether it may be made.
+        """Prepare for a session. record: writes a correction to the journal, and returns whether the correction may be made.
 
         first: the number of keyframes at the first round, 0 for none. patient: whether the session may wait for the process.
         """
@@ -54,7 +54,8 @@ class Rounds(ABC, Generic[Answer, Told]):
         self._replaying = False
 
     def expect(self, known: Iterable[Correction]) -> None:
-        """Replay its own among the corrections of a journal, each at its keyframe. No new round starts before `begin`."""
+        """Replay the corrections of class `told` from a journal, each at its keyframe. No process gets work before
+        `begin`."""
         self._known, self._replaying = deque(one for one in known if isinstance(one, self.told)), True
 
     def begin(self) -> None:
@@ -86,7 +87,7 @@ class Rounds(ABC, Generic[Answer, Told]):
 
     @property
     def _here(self) -> bool:
-        """Whether the session works itself."""
+        """Whether the session does the work without a separate process."""
         return self.quick and self._patient
 
     def _ask(self, number: int) -> None:
@@ -120,12 +121,12 @@ class Rounds(ABC, Generic[Answer, Told]):
 
     @abstractmethod
     def _request(self) -> Request[Answer] | None:
-        """Return the work of a round that begins now, None if there is nothing to do."""
+        """Return the work of a round that begins now, or None if nothing is to be done."""
 
     @abstractmethod
     def _correction(self, number: int, answer: Answer | None) -> Told | None:
-        """Return the correction at keyframe `number` by an answer, None if the map stays. The answer is None if the process
-        failed."""
+        """Return the correction that an answer makes at keyframe `number`, or None if the map stays as it is. The answer is
+        None if the process failed."""
 
     @abstractmethod
     def _take_up(self, correction: Told) -> None:

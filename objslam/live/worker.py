@@ -24,11 +24,11 @@ _NICE = 10
 """The niceness of the process, added to the session's (`os.nice`). A larger number leaves more CPU time to the session."""
 _THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _LENGTH = struct.Struct("<Q")
-"""A message begins with its length, bytes."""
+"""The format of the number before each message. This number is the length of the message in bytes."""
 
 
 class Request(Protocol[Answer_co]):
-    """Work for a process of its own. It is pickled, and so is its answer."""
+    """Work for a separate process. The request and its answer are pickled."""
 
     def solve(self) -> Answer_co:
         """Return the answer."""
@@ -54,7 +54,7 @@ class Worker(Generic[Answer]):
         self._waiting: list[bytes] = []  # The request until it is sent, because it may be large.
 
     def ask(self, request: Request[Answer]) -> None:
-        """Send a request. Take the `result` of the request before first."""
+        """Send a request. The caller must first take the `result` of the previous request."""
         self._answer, self._asked = None, True
         if self._process is None or self._process.poll() is not None:
             self._process = _start()
@@ -66,16 +66,16 @@ class Worker(Generic[Answer]):
 
     @property
     def busy(self) -> bool:
-        """Whether there is a request whose `result` was not taken."""
+        """Whether a request was sent whose `result` was not taken."""
         return self._asked
 
     @property
     def done(self) -> bool:
-        """Whether there is a request, and `result` returns at once."""
+        """Whether a request was sent and `result` returns at once."""
         return self._asked and (self._thread is None or not self._thread.is_alive())
 
     def result(self) -> Answer | None:
-        """Wait for the answer to the request, and return it. None if the process failed."""
+        """Wait for the answer to the request, and return it. Return None if the process failed."""
         if self._thread is not None:
             self._thread.join()
         self._thread, self._asked = None, False
@@ -142,7 +142,7 @@ def _write(pipe: IO[bytes], content: bytes) -> None:
 
 
 def _read(pipe: IO[bytes]) -> bytes | None:
-    """Return the next message, None at the end of the pipe."""
+    """Return the next message, or None at the end of the pipe."""
     head = pipe.read(_LENGTH.size)
     if len(head) < _LENGTH.size:
         return None
@@ -164,8 +164,8 @@ def main() -> None:
 
 
 def _receive(requests: queue.SimpleQueue[bytes]) -> None:
-    """Read requests until stdin ends, and then end this process. A session that was killed closes stdin, and does not do
-    more."""
+    """Read requests until stdin ends, and then end this process. If the session is killed, stdin ends, and no other sign
+    reaches this process."""
     try:
         with os.fdopen(os.dup(sys.stdin.fileno()), "rb") as asked:  # Python waits for the lock of sys.stdin when it ends.
             while (content := _read(asked)) is not None:

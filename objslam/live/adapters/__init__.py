@@ -34,7 +34,7 @@ _INTERFACE = "DDS: a network interface, by name or address, or auto for any. [de
 
 
 Wait = Callable[[], object]
-"""Returns once the map contains all messages that were pushed."""
+"""A function that returns once the map contains all messages that were pushed."""
 
 
 class Adapter(Protocol):
@@ -77,10 +77,11 @@ class LiveOptions(DdsOptions, SourceOptions):
 class Feed:
     """An adapter, with functions that the session calls for it.
 
-    views: each receives every snapshot. close: called at the end. ticks: called ten times a second. image: returns the image
-    of a camera, by its name, at a stamp, s. None if the adapter has no images. odom_frame: returns the name of the
-    odometry's frame, or None if --publish-tf must not publish the pose of this frame. late: returns what to do if frames
-    came too late for the map, "" if the source does not know.
+    views: functions that receive every snapshot. close: functions that are called at the end. ticks: functions that are
+    called ten times a second. image: returns the image of a camera, given the camera's name and a stamp, s. The function is
+    None if the adapter has no images. odom_frame: returns the name of the odometry's frame, or None if --publish-tf must not
+    publish the pose of this frame. late: returns advice to the user for the case that frames came too late for the map. The
+    advice is "" if the source has none.
     """
 
     adapter: Adapter
@@ -97,8 +98,9 @@ class LiveSource:
     """A named source of `objslam live`.
 
     says: its description in `--help`. opens: the function that makes its `Feed`. options: the class of its options, which
-    `LiveOptions` inherits. None if it has no options. recorded: returns whether its messages are now from a recording. Such
-    messages may be read as fast as they are mapped (--speed 0). None if the messages are never from a recording.
+    `LiveOptions` inherits, or None if the source has no options. recorded: a function that returns whether the messages now
+    come from a recording. Recorded messages may be read as fast as they are mapped (--speed 0). The function is None if the
+    messages never come from a recording.
     """
 
     says: str

@@ -18,14 +18,14 @@ from objslam.ros.messages.topic_types import IMAGES, LATCHED, is_read
 
 _TAKE = 50
 """The most messages that are taken from one reader before the next reader's turn. With a larger number, a flood of one topic
-delays the other topics more, and each message costs a little less."""
+delays the other topics more, but each message takes a little less time."""
 _MAX_READERS = 256  # The most open readers. A larger number costs memory.
 _MIN_BUFFER = 2 << 20  # The socket buffer, bytes, below which raw images cause a warning. A larger value warns more often.
 
 
 @dataclass
 class _Reader:
-    """A DDS reader for all publishers of one topic with one QoS kind. of: the publication of one of them.
+    """A DDS reader for all publishers of one topic with one QoS kind. of: the publication of one such publisher.
 
     since: when the reader was made, s, by `time.monotonic`. lost: the number of lost messages that are already counted.
     """
@@ -42,8 +42,8 @@ class _Reader:
 class _Heard:
     """What two readers received of one publisher.
 
-    own: the stamp of the first message that the reader of the publisher's kind received, ns.
-    others: the stamps of the messages that the other reader pushed before that, ns, the last QUEUE of them.
+    own: the stamp, ns, of the first message that the reader of the publisher's kind received. It is infinite before this
+    message. others: the stamps, ns, of the last QUEUE messages that the other reader pushed before this message.
     """
 
     own: float = math.inf
@@ -122,7 +122,8 @@ class DdsAdapter:
         return {topic for topic, _ in self._readers}.union(*self.choice.chosen.names.values())
 
     def _open(self, age: float) -> list[_Reader]:
-        """Open readers for the wanted topics that have none, and return them. age: the time since the start, s."""
+        """Open readers for the wanted topics without a reader, and return the new readers. age: the time since the start,
+        s."""
         offered = {publication.topic: publication.type for publication in self._publications}
         wanted = self.choice.wanted(offered, self.messages, settled=age >= HEAD_START)
         opened = []
@@ -134,7 +135,7 @@ class DdsAdapter:
                 if reader is not None:
                     self._readers[key] = reader
                     opened.append(reader)
-        order = {type_: rank for rank, type_ in enumerate(LATCHED)}  # Boxes need transforms and calibrations before them.
+        order = {type_: rank for rank, type_ in enumerate(LATCHED)}  # Boxes need earlier transforms and calibrations.
         self._readers = dict(sorted(self._readers.items(), key=lambda item: order.get(item[1].of.type, len(order))))
         return opened
 
@@ -185,11 +186,12 @@ class DdsAdapter:
             self.messages.receive(reader.of.type, reader.of.topic, message, info.source_timestamp / 1e9)
 
     def _is_mine(self, reader: _Reader, handle: int, stamp: int, found: Any) -> bool:
-        """Return whether this reader pushes a message of the publisher with this handle. stamp: of its sending, ns.
+        """Return whether this reader pushes a message of the publisher with this handle. stamp: the time of sending, ns.
 
         Two readers may receive one message, because a best-effort reader receives from reliable publishers too. The reader
-        of the publisher's own kind pushes it. Until that reader receives the publisher, the other one pushes its messages:
-        a robot may send as soon as anybody listens. If the publisher is unknown, the reader with the strictest QoS pushes.
+        of the publisher's own kind pushes it. Until that reader receives the publisher, the other reader pushes the
+        publisher's messages, because a robot may send as soon as anybody listens. If the publisher is unknown, the reader
+        with the strictest QoS pushes.
         """
         if self._publications.kind(handle) is None:
             self._look_around(found)
@@ -199,7 +201,7 @@ class DdsAdapter:
             return reader.of.kind == max(kinds)
         _, latched = kind
         if latched:
-            return kind == reader.of.kind  # It receives the old messages too, so nothing is lost before it is there.
+            return kind == reader.of.kind  # This reader receives old messages too, so no other has to push them.
         heard = self._heard.setdefault(handle, _Heard())
         if len(self._heard) > MOST:
             del self._heard[next(iter(self._heard))]
@@ -233,7 +235,7 @@ class DdsAdapter:
             where = f"{self.network.where}, domain {self.network.domain}{hint}"
             self.ledger.warn(f"no publisher of odometry, tf or detections on {where}")
         for reader in self._readers.values():
-            # The session's own tf is no publisher that a reader could be matched with.
+            # No reader is matched with the session's own publishers.
             others = (p for p in self._publications if not p.own)
             present = any((p.topic, p.kind) == (reader.of.topic, reader.of.kind) for p in others)
             if not reader.warned and present and now - reader.since > LONELY:

@@ -65,11 +65,11 @@ def events(log: Log, settings: Settings | None = None) -> Iterator[tuple[float, 
     """Yield the events of a log in time order: the time, s, whether the event is a frame, and the function that pushes it.
 
     The time of an event is its stamp, except for a frame. A frame directly follows the first pose of the robot's path at or
-    after its stamp, and has the time of this pose. So no frame waits for a pose (live.max_lag). If this pose is more than
-    live.max_late later, or if there is none, the frame keeps the time of its stamp.
+    after the frame's stamp, and has the time of this pose. So no frame waits for a pose (live.max_lag). If this pose does
+    not exist or is more than live.max_late later, the time of the frame is its own stamp.
     """
     settings = settings or Settings()
-    # Of each kind of event: the stamps, s, the rank (lower first at one stamp), and the function that returns the i-th push.
+    # For each kind of event: the stamps, s, the rank (lower first at one stamp), and the function that returns push i.
     kinds: list[tuple[np.ndarray, int, Callable[[int], Push]]] = []
     for path, which in ((log.localization, "push_localization"), (log.odometry, "push_odometry")):
         if path is not None:
@@ -91,7 +91,7 @@ def events(log: Log, settings: Settings | None = None) -> Iterator[tuple[float, 
 def _covered(log: Log, settings: Settings, detections: Detections) -> Floats:
     """Return the stamp (F,), s, of the first pose at or after each frame.
 
-    If there is none within live.max_late, return the frame's own stamp.
+    If no pose follows within live.max_late, return the frame's own stamp.
     """
     path = log.localization if log.odometry is None or settings.poses.use == "localization" else log.odometry
     own = detections.frame_stamps

@@ -34,8 +34,8 @@ from objslam.live.interface import Sink
 _CAMERA = "camera"
 _LONGEST = 1 << 20  # The longest line, bytes. Longer lines are dropped. A larger number costs memory.
 _CHUNK = 1 << 16  # The most bytes of one read. A larger number makes fewer reads.
-_FASTER = 1.5  # Stamps that run faster than the clock by this factor are of a recording. A larger number finds fewer.
-_WAIT = 0.1  # The longest time until a stop is noticed, s. A larger value costs less, and notices it later.
+_FASTER = 1.5  # Above this ratio of stamp time to clock time, a stream is a recording. A larger number finds fewer.
+_WAIT = 0.1  # The longest time until a stop is noticed, s. With a larger value, it is noticed later, and waiting costs less.
 
 
 @dataclass
@@ -85,7 +85,7 @@ class StdinAdapter:
             self._take(rest, number + 1)
 
     def _read(self, stop: threading.Event) -> bytes:
-        """Return the next bytes. They are b"" at the end of the stream, or when `stop` is set."""
+        """Return the next bytes. Return b"" at the end of the stream, or when `stop` is set."""
         source = self.stream.fileno()
         while not stop.is_set():
             if select.select([source], [], [], _WAIT)[0]:
@@ -121,7 +121,8 @@ class StdinAdapter:
             raise Malformed("type is none of camera, odometry, localization, mount, detections")
 
     def _compare(self, stamp: float) -> None:
-        """Compare the time since the first pose by its stamp, s, and by the clock."""
+        """Record how much faster the stamps have run than the clock since the first pose. stamp: the newest pose's stamp,
+        s."""
         if self._first is None:
             self._first = stamp, self.clock()
         self._faster = (stamp - self._first[0]) / max(self.clock() - self._first[1], 1e-3)

@@ -1,3 +1,2 @@
-"""Bodies of the landmarks of a running session. They describe the objects of a snapshot. Bearings are turned to their
-centres.
-"""
+"""Fits bodies to the landmarks of a running session. Bodies describe the objects of a snapshot. Bearings are turned to the
+centres of bodies."""

@@ -25,27 +25,28 @@ if TYPE_CHECKING:
 _FIRST = 30
 """The number of keyframes at the first round. Fewer keyframes have too few boxes of any object."""
 _GROWTH = 1.3
-"""A round begins when the number of keyframes has grown by this factor. With a larger factor, bearings are turned later.
-With a smaller one, the graph is solved more often."""
+"""The factor by which the number of keyframes grows between the starts of two rounds. With a larger factor, bearings are
+turned later. With a smaller factor, the graph is solved more often."""
 _DELAY = 0.1
-"""The map is corrected when the number of keyframes has grown by this share since the round began. A larger share suits
-slower machines, but corrects later."""
+"""The share by which the number of keyframes grows between the start of a round and the correction of the map. A larger
+share suits slower machines, but corrects later."""
 
 _CHANGED = 0.05
-"""A bearing in the graph is turned again if it changes by more than this number of its standard deviations. A larger value
-changes the graph less often, and keeps older bodies."""
+"""The change of a bearing, in its standard deviations, above which the bearing in the graph is turned again. A larger value
+changes the graph less often, but bearings then point to the centres of older bodies."""
 
 
 @dataclass(frozen=True)
 class CentringRequest:
-    """Some landmarks with their boxes, and the ids (n,) of these landmarks."""
+    """A request for the bodies of some landmarks. boxes: the landmarks with their boxes. ids: (n,) the ids of the
+    landmarks."""
 
     boxes: BodyRequest
     ids: Ints
 
     def solve(self) -> BodiesMessage:
-        """Return the bodies of these landmarks. The caller puts in the keyframe, which is 0 here. A landmark has shape 0,
-        for no body, if its body would hardly turn its bearings."""
+        """Return the bodies of the landmarks. The number of the keyframe is 0, and the caller must set it. A landmark gets
+        shape 0, which means no body, if its body would hardly turn its bearings."""
         found = self.boxes.fitted()
         n = len(self.ids)
         shape, half, yaw, covariance = np.zeros(n, dtype=np.int64), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 4, 4))
@@ -77,7 +78,7 @@ class BodyCentring(Rounds[BodiesMessage, BodiesMessage]):
         self._rays: dict[int, int] = {}  # How many rays each landmark had in its last round, by id.
 
     def _request(self) -> CentringRequest | None:
-        """Return the landmarks that may have a body. If there are too many, the ones that have grown most."""
+        """Return the landmarks that may have a body. If too many are due, return the ones whose rays have grown most."""
         m = self._mapper.state
         landmarks = m.landmarks
         if not any(camera.sees_size for camera in m.cameras):
@@ -108,12 +109,12 @@ class BodyCentring(Rounds[BodiesMessage, BodiesMessage]):
     def _take_up(self, correction: BodiesMessage) -> None:
         m = self._mapper.state
         if turn_to_centres(m, correction):
-            m.rebuild_in_slices()  # Bearings turn by little, so the next frame need not wait for a solve.
+            m.rebuild_in_slices()  # Bearings turn by small angles, so the next frame need not wait for a solve.
             self._counters.accept("turns to the centres of bodies")
 
 
 def turn_to_centres(m: MapState, found: BodiesMessage) -> bool:
-    """Turn the bearings of landmarks to the centres of these bodies. A landmark of shape 0 has none.
+    """Turn the bearings of landmarks to the centres of the bodies in `found`. A landmark of shape 0 has no body.
 
     Return whether bearings in the graph have changed. A bearing that would hardly change (`_CHANGED`) is not turned.
     Landmarks that are not in the map any more are left out.

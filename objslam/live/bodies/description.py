@@ -16,17 +16,18 @@ from objslam.live.worker import Worker
 from objslam.mapping.bodies.fitting import FEWEST
 
 _GROWTH = 1.25
-"""A body is fitted again when the number of the object's rays has grown by this factor. With a larger factor, bodies are
+"""The factor by which the number of an object's rays grows before its body is fitted again. With a larger factor, bodies are
 older."""
 _REST = 1.0
-"""The time between two fits, s. A longer time leaves more of the processor to others, but makes bodies older."""
+"""The time from the end of a fit to the start of the next fit, s. A longer time leaves more of the processor to others, but
+makes bodies older."""
 
 
 @dataclass(frozen=True)
 class _Fitted:
-    """A landmark in a fit: the number of its rays, its position (3,), m, and its body, None before the fit has ended.
+    """A landmark in a fit: the number of its rays, its position (3,), m, and its body, or None before the fit has ended.
 
-    turned: whether its bearings pointed to the centre of a body.
+    turned: whether the landmark's bearings pointed to the centre of a body.
     """
 
     rays: int
@@ -72,8 +73,8 @@ class BodyEstimator:
     def described(self, o: MapObject, turned: bool) -> MapObject:
         """Return a resolved object with its body. turned: whether its bearings point to the centre of a body.
 
-        If the landmark has moved since the fit, the body has moved with it, unless the landmark has moved to the centre of
-        its body. The covariance comes from the fit.
+        If the landmark has moved since the fit, the body moves with it. If `turned` has changed since the fit, the body has
+        its centre at the landmark. The covariance comes from the fit.
         """
         fitted = self._fitted.get(o.id)
         if fitted is None or fitted.body is None or o.status != "ok":
@@ -96,8 +97,8 @@ class BodyEstimator:
             self._fitted[j] = replace(fitted, body=body)
 
     def _due(self, m: MapState, covariances: dict[int, Floats]) -> Ints:
-        """Return the rows of the landmarks to fit, in the order of their ids. If too many are due, the ones that have grown
-        most are fitted."""
+        """Return the rows of the landmarks to fit, in the order of their ids. If too many are due, the ones whose rays have
+        grown most are fitted."""
         landmarks = m.landmarks
         self._fitted = {j: self._fitted[j] for j in landmarks.id.tolist() if j in self._fitted}
         before = np.array([self._fitted[j].rays if j in self._fitted else 0 for j in landmarks.id.tolist()])

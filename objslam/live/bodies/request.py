@@ -19,9 +19,10 @@ from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.solution import Solution
 
 _BOXES = 40
-"""The most boxes of an object in a fit. They are spread evenly over its boxes. More make bodies surer and fits slower."""
+"""The most boxes of an object in a fit. They are spread evenly over all its boxes. With a larger number, bodies are more
+certain, and fits take longer."""
 _OBJECTS = 100
-"""The most objects in one fit. A larger number delays the bodies of all of them, and takes longer to collect."""
+"""The most objects in one fit. With a larger number, all bodies come later, and the boxes take longer to collect."""
 
 
 @dataclass(frozen=True)
@@ -37,24 +38,25 @@ class BodyRequest:
         return with_bodies(self.solution, self.cameras, self.settings)
 
     def solve(self) -> tuple[PlacedBody | None, ...]:
-        """Return the body of each landmark, None for a point."""
+        """Return the body of each landmark, or None for a landmark that stays a point."""
         found = self.fitted().bodies
         return (None,) * self.solution.association.count if found is None else found
 
 
 def most_grown(m: MapState, rows: Ints, before: Ints) -> Ints:
-    """Return the rows of the landmarks to fit, in the order of their ids. If there are too many, return the ones whose rays
+    """Return the rows of the landmarks to fit, in the order of their ids. If too many are due, return the ones whose rays
     have grown most.
 
-    rows: (n,) of the landmarks that are due. before: (n,) the numbers of their rays in their last fits, 0 without one.
+    rows: (n,) the rows of the landmarks that are due. before: (n,) the number of rays of each landmark in its last fit, 0 if
+    it had none.
     """
     growth = m.landmarks.seen[rows] / np.maximum(before, 1)
     return np.sort(rows[np.argsort(-growth, kind="stable")[:_OBJECTS]])
 
 
 def body_request(m: MapState, rows: Ints, covariances: Floats) -> BodyRequest:
-    """Return a request for the landmarks in rows (n,), in the order of their ids. covariances: (n, 3, 3) m^2, of these
-    landmarks."""
+    """Return a request for the landmarks in rows (n,), in the order of their ids. covariances: (n, 3, 3) of the landmarks,
+    m^2."""
     ids = m.landmarks.id[rows]
     boxes = _some_boxes(m, ids)
     frames, index = np.unique(np.searchsorted(m.keyframes.id, m.rays.keyframe[boxes]), return_inverse=True)
@@ -76,7 +78,8 @@ def body_request(m: MapState, rows: Ints, covariances: Floats) -> BodyRequest:
 
 
 def _some_boxes(m: MapState, ids: Ints) -> Ints:
-    """Return the rows of at most `_BOXES` rays of each landmark, in the order of the rays. ids: (n,) in order."""
+    """Return the rows of at most `_BOXES` rays of each landmark, in the order of the rays. ids: (n,) of the landmarks, in
+    ascending order."""
     mine = np.flatnonzero(m.rays.used & np.isin(m.rays.owner, ids))
     mine = mine[np.argsort(m.rays.owner[mine], kind="stable")]
     of_each = np.split(mine, np.searchsorted(m.rays.owner[mine], ids[1:]))

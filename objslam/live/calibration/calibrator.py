@@ -1,4 +1,5 @@
-"""Decides when a running session estimates its shared errors, such as clock offsets, and when these correct the map."""
+"""Decides when a running session estimates its shared errors, such as clock offsets, and when the estimates correct the
+map."""
 
 from __future__ import annotations
 
@@ -24,23 +25,23 @@ if TYPE_CHECKING:
     from objslam.live.mapper.mapper import Mapper
 
 _GROWTH = 1.5
-"""A calibration begins when the number of keyframes has grown by this factor since the last calibration began. As the
-intervals grow, the time of all calibrations is proportional to the number of keyframes. A larger factor calibrates more
-rarely."""
+"""The factor by which the number of keyframes grows between the starts of two calibrations. Because the intervals grow, the
+time of all calibrations is proportional to the number of keyframes. A larger factor calibrates more rarely."""
 _DELAY = 0.15
-"""The map is corrected when the number of keyframes has grown by this share since the calibration began. If the worker is
-done by then, the map does not depend on the machine's speed. A larger share suits slower machines, but corrects later."""
+"""The share by which the number of keyframes grows between the start of a calibration and the correction of the map. If the
+worker is done by then, the map does not depend on the machine's speed. A larger share suits slower machines, but corrects
+later."""
 _CHANGED = 1.0
-"""The map is corrected if an error has changed by more than this, in standard deviations. A larger value corrects more
-rarely."""
+"""The change of an error, in standard deviations, above which the map is corrected. A larger value corrects more rarely."""
 _LIKE = 0.2
-"""The map is also corrected if the noise of the localisation, or how long its errors last, has changed by more than this
-share. The estimates of a short drive differ by as much from round to round. A larger share corrects more rarely."""
+"""The relative change of the localisation's noise, or of the time for which its errors last, above which the map is
+corrected. After a short drive, the estimates of two rounds differ by about this share. A larger share corrects more
+rarely."""
 _NO_DELAY = 2.0
-"""A session does not correct a camera clock that is behind by at most this multiple of the standard deviation of the
-estimate. With a correction, each frame would wait longer for its pose, by the offset of the clock, and the gain is small. A
-larger value maps sooner, but with larger errors. At 1, one right clock in six looks late in each round, and the first round
-then made every frame of the next 600 wait 65 ms. At 2, it is one in forty."""
+"""The largest delay of a camera clock that a session does not correct, in standard deviations of the estimate. With a
+correction, each frame would wait longer for its pose, by the offset of the clock, and the gain is small. A larger value maps
+sooner, but with larger errors. At 1, one right clock in six looks late in each round. The first round then made each of the
+next 600 frames wait 65 ms. At 2, one right clock in forty looks late."""
 
 
 _LATE = frozenset(("turn_slip", "turn_per_m", *LENS))
@@ -56,7 +57,7 @@ def observed(found: Calibration, now: Floats) -> Calibration:
 
     Otherwise, noise would move the map with each calibration. A camera clock that is behind by no more than `_NO_DELAY` is
     not corrected. Observed errors get their most probable values, given the other values. The covariance is about the new
-    values, so it contains their distance from the most probable ones.
+    values, so it contains the distance of the new values from the most probable values.
     """
     clock = np.array([kind(name) == "clock" for name in found.names], dtype=bool)
     behind = clock & (found.values > 0) & (found.values <= _NO_DELAY * found.sigma)
@@ -72,7 +73,8 @@ def observed(found: Calibration, now: Floats) -> Calibration:
 
 
 def _waits_in_vain(found: Calibration, now: Floats) -> bool:
-    """Return whether frames wait for a camera clock by its present value in `now` (P,), but it may be right (`observed`)."""
+    """Return whether frames wait because of the value of a camera clock in `now` (P,), but this clock may be right
+    (`observed`)."""
     clock = np.array([kind(name) == "clock" for name in found.names], dtype=bool)
     return bool((clock & (now > 0) & (found.values == 0)).any())
 
@@ -103,9 +105,11 @@ class Calibrator(Rounds[tuple[Calibration, NoiseFactors] | None, CalibrationMess
         self._counters, self._name = counters, name
 
     def _request(self) -> CalibrationRequest | None:
-        """Return a calibration with all keyframes, if shared errors are to be estimated and there are objects.
+        """Return a request with all keyframes. Return None if no shared errors are to be estimated, or if the map has no
+        objects.
 
-        Other noise is not estimated. It stays as in the settings until the end of the session, and so do the errors `_LATE`.
+        Only the noise of the localisation is estimated. Until the end of the session, all other noise stays as in the
+        settings, and so do the errors `_LATE`.
         """
         m = self._mapper.state
         found = collect(m, self._name, running=True)

@@ -27,12 +27,12 @@ from objslam.mapping.solution import seen_something
 class Collected:
     """The data of a session in the form of offline mapping.
 
-    keyframes, rays: as measured, the keyframes in time order. keyframe_ids, numbers: (K,), (R,) the session's ids of the
-    keyframes and numbers of the rays. association: the object of each ray. ids: (N,) the session's ids of the objects.
-    map_T_camera, positions: (K, 4, 4), (N, 3) the session's estimate. log: the paths and cameras. errors: gives the
-    keyframes and rays for any values of the shared errors. None if neither errors nor noise are estimated. theta: (P,) the
-    present values of the errors, None without `errors`. An error that the session knows and does not estimate is already
-    corrected in keyframes, rays and log.
+    keyframes, rays: as measured, with the keyframes in time order. keyframe_ids: (K,) the session's ids of the keyframes.
+    numbers: (R,) the session's numbers of the rays. association: the object of each ray. ids: (N,) the session's ids of the
+    objects. map_T_camera: (K, 4, 4) and positions: (N, 3), m, are the session's estimate. log: the paths and cameras.
+    errors: gives the keyframes and rays for any values of the shared errors, or is None if neither errors nor noise are
+    estimated. theta: (P,) the present values of the errors, None without `errors`. An error that the session knows and does
+    not estimate is already corrected in keyframes, rays and log.
     """
 
     keyframes: Keyframes
@@ -51,9 +51,9 @@ class Collected:
 def collect(m: MapState, name: str, running: bool = False) -> Collected:
     """Collect the keyframes, the rays, the association and the estimate of a session. name: the name of the log.
 
-    If there is a localisation, keyframes that it does not cover are left out, as in offline mapping. running: whether the
-    session goes on. If not, the left out keyframes and their boxes are counted, and the odometry continues the localisation.
-    Tracks with enough rays become objects too.
+    Keyframes that an existing localisation does not cover are left out, as in offline mapping. running: whether the session
+    goes on. If it has ended, the keyframes that are left out are counted with their boxes, and the odometry continues the
+    localisation. Landmarks and tracks with enough rays become objects.
     """
     m.graph.refresh()
     k, r = m.keyframes, m.rays
@@ -104,7 +104,7 @@ def collect(m: MapState, name: str, running: bool = False) -> Collected:
 
 
 def _of_robot_parts(m: MapState, rows: Ints) -> Bools:
-    """Return which rays in these rows (R,) are of parts of the robot, which the session found only later."""
+    """Return which rays in these rows (R,) show parts of the robot that the session only recognised later."""
     part, camera = np.zeros(len(rows), dtype=bool), m.camera_of_rays(rows)
     for number, finder in m.robot_parts.items():
         mine = np.flatnonzero(camera == number)
@@ -113,7 +113,7 @@ def _of_robot_parts(m: MapState, rows: Ints) -> Bools:
 
 
 def _second_labels(m: MapState, rows: Ints) -> Bools:
-    """Return which rays in these rows (R,) are of second labels, which the session found only later."""
+    """Return which rays in these rows (R,) have second labels that the session only recognised later."""
     second = np.zeros(len(rows), dtype=bool)
     if not m.given.rays.second_labels:
         return second
@@ -178,7 +178,7 @@ def recorded_log(m: MapState, name: str, keyframes: Keyframes) -> Log:
 
 
 def _mount(keyframes: Keyframes, camera: int) -> Trajectory | None:
-    """Return base_T_camera over time, None if the camera did not move on the robot."""
+    """Return base_T_camera over time, or None if the camera did not move on the robot."""
     mine = np.flatnonzero(keyframes.camera == camera)
     mounts = keyframes.base_T_camera[mine]
     if not len(mine) or (mounts == mounts[0]).all():

@@ -14,10 +14,10 @@ from objslam.live.mapper.state import MapState
 
 @dataclass(frozen=True)
 class Covered:
-    """The keyframes that the localisation of a session covers, all of them without a localisation.
+    """The keyframes that the localisation of a session covers. Without a localisation, these are all keyframes.
 
-    mask: (n,) which they are. map_T_base: (n, 4, 4) the poses that the paths give. measured: the localisation. localization:
-    the same, also where the odometry continues it.
+    mask: (n,) whether each keyframe is covered. map_T_base: (n, 4, 4) the poses that the paths give. measured: the
+    localisation as measured. localization: the localisation, also where the odometry bridges and continues it.
     """
 
     mask: Bools
@@ -27,8 +27,8 @@ class Covered:
 
 
 def while_running(m: MapState, rows: Ints) -> Covered:
-    """Return which keyframes in these rows (n,) the session has localised so far. If it has localised none, all of them are
-    covered, and the session has no localisation."""
+    """Return which keyframes in these rows (n,) the session has localised so far. If the session has localised no keyframe,
+    all keyframes are covered, and the result has no localisation."""
     k = m.keyframes
     if not k.localized.any():
         return Covered(np.ones(len(rows), dtype=bool), k.map_T_base[rows], None, None)
@@ -39,7 +39,7 @@ def while_running(m: MapState, rows: Ints) -> Covered:
 def at_the_end(m: MapState, rows: Ints) -> Covered:
     """Return which keyframes in these rows (n,) the localisation covers where the odometry bridges and continues it.
 
-    The odometry continues it over any distance, because the solve starts at the poses of the session.
+    The odometry may continue the localisation over any distance, because the solve starts at the poses of the session.
     """
     k, settings = m.keyframes, m.given
     driven, localized = m.course.driven.trajectory(), m.course.localized.trajectory()
@@ -58,7 +58,8 @@ def at_the_end(m: MapState, rows: Ints) -> Covered:
 def into_frame(m: MapState, rows: Ints, covered: Covered) -> Floats:
     """Return the pose (4, 4) of the session's frame in the frame of the keyframes covered at the end.
 
-    It is another frame if the localisation was too rare to localise a keyframe of the session. rows: (n,) as in `covered`.
+    The two frames differ if the localisation was too rare to localise a keyframe while the session ran. rows: (n,) the rows
+    of the keyframes of `covered`.
     """
     first = np.flatnonzero(covered.mask)[:1]
     if covered.localization is None or m.keyframes.localized.any() or not len(first):

@@ -20,8 +20,8 @@ from objslam.live.mapper.state import MapState
 def recalibrate(m: MapState, calibration: Calibration, noise: NoiseFactors) -> None:
     """Correct the map by a calibration, whose values replace earlier values of its errors.
 
-    The new map depends only on the old map and the arguments, so that a resumed session makes it again. noise: of the
-    localisation. Its other factors do not count.
+    The new map depends only on the old map and the arguments, so a resumed session makes the same map. noise: only the
+    factors of the localisation are used.
     """
     before = m.errors
     m.errors = before | dict(zip(calibration.names, calibration.values.tolist(), strict=True))
@@ -100,8 +100,8 @@ def _remeasure_rays(m: MapState, before: dict[str, float]) -> bool:
 def _carried(m: MapState, drifted: Floats) -> Floats:
     """Return the drift (N + T, 6, 6) of landmarks and tracks on the corrected course.
 
-    drifted: (K, 6, 6) the drift of the keyframes before the correction. By its old heading drift, an object is matched to
-    the first keyframe that had drifted at least as far. It gets the new drift of this keyframe.
+    drifted: (K, 6, 6) the drift of the keyframes before the correction. Each object is matched to the first keyframe whose
+    old heading drift was at least the object's. The object gets the new drift of this keyframe.
     """
     order = m.time_order()
     passed = np.maximum.accumulate(drifted[order][:, 2, 2])
@@ -110,7 +110,7 @@ def _carried(m: MapState, drifted: Floats) -> Floats:
 
 
 def _shift_times(m: MapState, times: Floats) -> None:
-    """Shift the stamps of landmarks and tracks like the stamps of the keyframes that saw them.
+    """Shift the stamps of each landmark and track by the same time as the stamps of the keyframes that saw it.
 
     times: (K,) s, the stamps of the keyframes before the correction.
     """

@@ -29,8 +29,8 @@ class CalibrationRequest:
     settings: Settings
 
     def solve(self) -> tuple[Calibration, NoiseFactors] | None:
-        """Return the shared errors and the noise that fit best, None if they cannot be estimated. Raises SolveError if the
-        solve fails."""
+        """Return the shared errors and the noise that fit best, or None if they cannot be estimated. Raises SolveError if
+        the solve fails."""
         from objslam.core.diagnostics import Ledger
         from objslam.core.noise import NOMINAL
         from objslam.graph.batch_solver import solve_joint

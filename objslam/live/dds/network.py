@@ -46,10 +46,10 @@ _OPEN: dict[int, tuple[str | None, Network]] = {}
 def open_network(domain: int | None = None, interface: str | None = None) -> Network:
     """Join a DDS domain, or return the network of a domain that the process has already joined.
 
-    domain: its number. None takes ROS_DOMAIN_ID, or 0 if that is unset. interface: the name or address of an interface, or
-    "auto" for any. None takes CYCLONEDDS_URI, or loopback if that is unset. Raises ObjslamError if cyclonedds is not
-    installed or the domain cannot be joined, and ConfigError if an argument is invalid, or the domain is already open on
-    another interface.
+    domain: the number of the domain. None takes ROS_DOMAIN_ID, or 0 if this variable is unset. interface: the name or
+    address of an interface, or "auto" for any. None takes CYCLONEDDS_URI, or loopback if this variable is unset. Raises
+    ObjslamError if cyclonedds is not installed or the domain cannot be joined, and ConfigError if an argument is invalid, or
+    the domain is already open on another interface.
     """
     try:
         with _without_stderr():
@@ -105,27 +105,27 @@ def _join(domain: int, interface: str | None) -> Network:
 def _leave(entity: Any) -> None:
     """Leave a domain with all its entities, before the interpreter ends.
 
-    Threads of the DDS library release Python's types. A thread that asks for the interpreter during its end is stopped for
-    ever. The library would wait for this thread, and so the process would never end. The domain is left while the thread of
-    `_listen` still reads the log of the library. Later nobody would read it. A flood of malformed packets would fill the
-    pipe, and the library would wait.
+    Threads of the DDS library release Python's types. A thread that asks for the interpreter while the interpreter ends is
+    stopped for ever. The library would wait for this thread, and so the process would never end. The domain is left while
+    the thread of `_listen` still reads the log of the library. Later, nobody would read this log. A flood of malformed
+    packets would then fill the pipe, and the library would wait.
     """
-    entity.__del__()  # The binding has no other name for it. A second call does nothing.
+    entity.__del__()  # The binding offers no other way to delete an entity. A second call does nothing.
 
 
 @contextmanager
 def _without_stderr() -> Iterator[None]:
-    """Hide C's `stderr` while the DDS library is imported and opens a domain. The library goes on to write to the hidden
+    """Hide C's `stderr` while the DDS library is imported and opens a domain. Later, the library still writes to the hidden
     file.
 
-    Otherwise each malformed packet from the network would write a line to the terminal, besides the one that `_listen`
-    counts. The library has no setting for this. Python itself does not write to C's `stderr`, but to its descriptor. Where
-    the system has no such variable, the warnings are printed.
+    Otherwise the library would write a line to the terminal for each malformed packet from the network, although `_listen`
+    already counts the packet. The library has no setting for this. Python itself does not write to C's `stderr`, but to its
+    descriptor. If the system has no such variable, the warnings are printed.
     """
     system = ctypes.CDLL(None)
     try:
         stderr = ctypes.c_void_p.in_dll(system, "stderr")
-    except ValueError:  # It has another name here.
+    except ValueError:  # This system has no variable of this name.
         yield
         return
     system.fopen.restype = ctypes.c_void_p
@@ -198,7 +198,7 @@ def _listen(reading: int, unread: Counter[str]) -> None:
 
 
 def receive_buffer() -> int | None:
-    """Return the largest socket buffer that the system allows, bytes, None if unknown."""
+    """Return the size in bytes of the largest socket buffer that the system allows, or None if it is unknown."""
     try:
         return int(Path("/proc/sys/net/core/rmem_max").read_text(encoding="ascii"))
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""The publishers that the discovery of DDS found, as many as a session keeps."""
+"""Keeps the publishers that the discovery of DDS found, up to a largest number."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from objslam.ros.messages.topic_types import is_tags
 MOST = 1000
 """The most publishers that are kept. With a larger number, many made-up publishers slow down the choice of topics more."""
 Kind = tuple[bool, bool]
-"""A QoS: whether it is reliable, and whether old messages are kept (transient-local)."""
+"""The QoS of a publisher: whether it is reliable, and whether old messages are kept (transient-local)."""
 
 
 @dataclass
 class Publication:
-    """A publisher. type_id: of its type, None if it declares none. own: whether this session is the publisher."""
+    """A publisher. type_id: the id of its type, or None if it declares none. own: whether this session is the publisher."""
 
     topic: str
     type: str
@@ -29,17 +29,17 @@ class Publication:
 class Publications:
     """The publishers by handle, at most `MOST`.
 
-    If there are more, one type of messages with very many publishers must not remove all others. So a publisher of the type
-    with the most publishers is removed. Of this type, it is the one whose topic has the longest name, because `TopicChoice`
-    prefers short names. All types of tags count as one type, because a program can invent more of them.
+    Above this number, a publisher of the type with the most publishers is removed. So one type with very many publishers
+    cannot remove all others. Within this type, the publisher whose topic has the longest name is removed, because
+    `TopicChoice` prefers short names. All types of tags count as one type, because a program can invent more of them.
     """
 
     def __init__(self, kept: Callable[[], Collection[str]]) -> None:
-        """kept: returns the topics that never give way, such as topics that the user chose."""
+        """kept: returns the topics whose publishers are never removed, such as topics that the user chose."""
         self._kept, self._found = kept, dict[int, Publication]()
-        self._gone: dict[int, Kind] = {}  # The kinds of the last publishers that went: their messages may still wait.
+        self._gone: dict[int, Kind] = {}  # The kinds of the publishers that left last. Their messages may still wait.
         self._count: Counter[str] = Counter()
-        self._longest: dict[str, int] = {}  # The handle that gives way first, by group. It is searched when it is needed.
+        self._longest: dict[str, int] = {}  # The handle that is removed first, by group. It is searched when needed.
 
     def __len__(self) -> int:
         return len(self._found)
@@ -48,12 +48,12 @@ class Publications:
         return iter(list(self._found.values()))
 
     def kind(self, handle: int) -> Kind | None:
-        """Return the kind of the publisher with a handle, also if the publisher has left recently. None if it is not
-        kept."""
+        """Return the kind of the publisher with a handle, even if the publisher has left recently. Return None if its kind
+        is not kept."""
         return self._found[handle].kind if handle in self._found else self._gone.get(handle)
 
     def remove(self, handle: int) -> Publication | None:
-        """Forget a publisher, and return it. None if it is not kept."""
+        """Forget a publisher, and return it. Return None if it is not kept."""
         gone = self._found.pop(handle, None)
         if gone is not None:
             self._gone[handle] = gone.kind
@@ -66,7 +66,7 @@ class Publications:
         return gone
 
     def add(self, handle: int, new: Publication) -> Publication | None:
-        """Keep a publisher. Returns the publisher that is removed, which may be the new one, or None if there is room."""
+        """Keep a publisher. Return the publisher that is removed, which may be the new one, or None if all are kept."""
         out = self.remove(handle)
         if out is None and len(self) >= MOST:
             worst = self._gives_way(new)
@@ -83,7 +83,7 @@ class Publications:
         return out
 
     def _gives_way(self, new: Publication) -> int | None:
-        """Return the handle of the publisher that gives way to a new one, None if there is none."""
+        """Return the handle of the publisher that is removed for a new one, or None if no publisher may be removed."""
         kept = self._kept()
         chosen = new.topic in kept
         crowd, most = self._count.most_common(1)[0]

@@ -13,14 +13,16 @@ from objslam.output.export.map_messages import MapMessages
 _TYPE = "tf2_msgs/msg/TFMessage"
 _QUEUE = 100  # The most transforms that wait for a slow subscriber, as in tf2. A larger number costs memory.
 _AHEAD = 0.2
-"""Each transform is dated this far ahead of the newest pose, s, because tf2 does not extrapolate. Transforms are 0.1 s
-apart, so 0.2 s bridge a late one. A larger value keeps an old transform in use for longer."""
+"""The time, s, by which the stamp of a transform is later than the newest pose. tf2 does not extrapolate, so the stamp must
+be ahead. Transforms are 0.1 s apart, so 0.2 s bridge one late transform. A larger value keeps an old transform in use for
+longer."""
 
 
 class TransformPublisher:
     """Publishes the newest `Snapshot.map_T_odom` on /tf. Call its methods from one thread only.
 
-    odom_frame: returns the frame of the odometry, None if it is unknown or has another parent. tf allows one parent only.
+    odom_frame: returns the frame of the odometry, or None if this frame is unknown or has another parent. tf allows only one
+    parent.
     """
 
     def __init__(self, network: Network, odom_frame: Callable[[], str | None], topic: str = "/tf") -> None:
@@ -41,7 +43,8 @@ class TransformPublisher:
             self._newest, self._messages.frame = snapshot.map_T_odom, snapshot.map.frame
 
     def send(self, stamp: float) -> None:
-        """Publish the transform if it is known. stamp: of the newest pose, s. The transform is dated `_AHEAD` later."""
+        """Publish the transform if it is known. stamp: the stamp of the newest pose, s. The transform's stamp is `_AHEAD`
+        later."""
         child = self._odom_frame()
         if self._newest is None or child is None or not math.isfinite(stamp):
             return

@@ -21,7 +21,8 @@ def dds_topic(topic: str) -> str:
 
 
 def ros_topic(name: str) -> str | None:
-    """Return the ROS topic of a DDS topic's name, None for anything else, such as a service."""
+    """Return the ROS topic of a DDS topic's name, or None if the name is not of a ROS topic, but for example of a
+    service."""
     return "/" + name.removeprefix(_PREFIX) if name.startswith(_PREFIX) else None
 
 
@@ -32,7 +33,7 @@ def dds_type(type_: str) -> str:
 
 
 def ros_type(name: str) -> str | None:
-    """Return the ROS type of a DDS type's name, None for anything else."""
+    """Return the ROS type of a DDS type's name, or None if the name is not of a ROS type."""
     package, middle, rest = name.partition(_PARTS[0])
     return type_name(f"{package}/msg/{rest.removesuffix(_PARTS[1])}") if middle and rest.endswith(_PARTS[1]) else None
 

@@ -16,14 +16,15 @@ from objslam.live.mapper.frame_association import FrameRays
 from objslam.live.mapper.state import MapState
 from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
 
-_MOUNTS = 4096  # The mounts that are kept for each camera. With a larger number, frames may arrive later. It costs memory.
+_MOUNTS = 4096  # The mounts that are kept for each camera. A larger number serves later frames, and costs memory.
 
 
 @dataclass(frozen=True)
 class FrameView:
-    """The bearings of the usable boxes of an image. camera: the number of its camera.
+    """The bearings of the usable boxes of an image. camera: the number of the image's camera.
 
-    mount: (4, 4) base_T_camera as received. base_T_camera: (4, 4) corrected for the shared errors.
+    mount: (4, 4) base_T_camera as received. base_T_camera: (4, 4) the same, corrected for the shared errors. rays: the
+    bearings.
     """
 
     camera: int
@@ -95,9 +96,10 @@ class BearingExtractor:
         return FrameView(number, mount, base_T_camera, rays)
 
     def _without_repeats(self, frame: FrameMessage, camera: Camera, number: int) -> tuple[FrameMessage, Ints]:
-        """Return the frame without second labels and boxes of parts of things, and the numbers of the labels of its boxes.
+        """Return the frame without second labels and without boxes of parts of things, and the label numbers of the boxes
+        left.
 
-        number: of the camera.
+        number: the number of the camera.
         """
         for name in sorted(set(frame.labels) - self._label_number.keys()):
             self._label_number[name] = len(self._labels)
@@ -108,7 +110,7 @@ class BearingExtractor:
         return _without(parts_of_things(*measured, camera, self._settings, self._ledger, frame.whole), frame, label)
 
     def _second_labels(self, frame: FrameMessage, label: Ints, camera: Camera, number: int) -> Bools:
-        """Return which boxes of the frame give the things of other boxes second labels, (n,). Count them."""
+        """Return which boxes (n,) of the frame give a second label to the thing of another box. Count these boxes."""
         second = np.zeros(len(frame), dtype=bool)
         if not self._settings.rays.second_labels or not tells_labels(camera, frame.whole):
             return second

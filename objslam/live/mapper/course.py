@@ -1,7 +1,8 @@
-"""The course of the robot: odometry and localisation joined to one path, in the frame of its first pose (`start`).
+"""Joins odometry and localisation to one path, the course of the robot. The frame of its first pose is `start`.
 
-Each of the two is a path, and gaps divide a path into stretches. The course is a chain of pieces. A piece is one stretch, or
-a localisation that replaces missing odometry. If possible, localisation also places a piece relative to earlier pieces.
+Odometry and localisation are two paths, and gaps divide a path into stretches. The course is a chain of pieces. A piece is
+one stretch, or a localisation that replaces missing odometry. If possible, localisation also places a piece relative to
+earlier pieces.
 """
 
 from collections.abc import Mapping
@@ -19,7 +20,7 @@ from objslam.graph.factors.odometry import UNKNOWN_TURN, UNKNOWN_WAY
 from objslam.live.mapper.tables import KeyframeTable, PathTable
 from objslam.live.mapper.trajectory_buffer import PathBuffer
 
-_KEPT = 3.0  # Poses are kept for live.max_late and this time, s, for frames in a queue. A larger value costs memory.
+_KEPT = 3.0  # Poses are kept for live.max_late plus this time, s, for queued frames. A larger value costs memory.
 _LOCALIZED = -1  # The stretch number of every pose from localisation, because all these poses share one coordinate frame.
 
 
@@ -28,7 +29,8 @@ class Placed:
     """The pose of the robot at the stamp of an image, from the odometry or from the localisation.
 
     piece: the number of the piece. The motion between two images of one piece is measured. map_T_base: (4, 4) the pose in
-    the frame of its path, odom or map. start_T_base: (4, 4) the pose on the course. drift: (6, 6) its accumulated drift.
+    the frame of its path, odom or map. start_T_base: (4, 4) the pose on the course. drift: (6, 6) the drift covariance that
+    the course has accumulated up to the pose. by_odometry: whether the odometry gives the pose.
     """
 
     by_odometry: bool
@@ -43,7 +45,7 @@ class _Piece:
     """A piece of the course.
 
     stretch: the number of the stretch of the odometry, or _LOCALIZED. start_T_path: (4, 4) places the first pose of the path
-    on the course. drift: (6, 6) is added to the path's own drift, to get the drift on the course.
+    on the course. drift: (6, 6) the covariance to add to the path's own drift, to get the drift on the course.
     """
 
     stretch: int
@@ -64,7 +66,7 @@ class Course:
         self._correction = correction or OdometryCorrection({})
         self.odometry = PathBuffer(settings.odometry, seconds, self._max_gap)
         self.localization = PathBuffer(settings.odometry, seconds, self._max_gap)
-        reach = 2 * settings.calibration.max_clock  # A correction of a clock may move a stamp from one bound to the other.
+        reach = 2 * settings.calibration.max_clock  # A clock correction may move a stamp from one bound to the other.
         self.driven = PathTable(self._max_gap, reach, seconds)
         self.localized = PathTable(self._max_gap, reach, seconds)
         self._noise = settings.localization.yaw, settings.localization.xy
@@ -74,7 +76,8 @@ class Course:
         self._newest = -np.inf
 
     def add_odometry(self, stamp: float, pose: Floats, keyframes: KeyframeTable) -> None:
-        """Append a pose (4, 4) of the odometry at a stamp, s, later than all others. keyframes: of the map so far."""
+        """Append a pose (4, 4) of the odometry at a stamp, s, later than all others. keyframes: the keyframes of the map so
+        far."""
         self.driven.append(stamp, pose, keyframes.stamp)
         self.odometry.append(stamp, self._correction.correct(stamp, pose))
         self._localized_by_then = self.localization.newest
@@ -89,9 +92,9 @@ class Course:
     ) -> None:
         """Correct the odometry by new values of its errors, and move the pieces of the course and the keyframes accordingly.
 
-        errors: the new values by name. corrected: the whole odometry, corrected by them. keyframes: with their new stamps
-        and map_T_base. This function changes their start_T_base and drift. A piece with a frame of its own keeps the pose of
-        its first keyframe.
+        errors: the new values by name. corrected: the whole odometry, corrected by these values. keyframes: the keyframes
+        with their new stamps and map_T_base. This function changes their start_T_base and drift. A piece with a frame of its
+        own keeps the pose of its first keyframe.
         """
         said = self.driven.trajectory()
         self._correction = OdometryCorrection(errors, said, corrected)
@@ -157,8 +160,8 @@ class Course:
         return stretch is not None and (goes_on or localization.newest >= odometry.stretch_begin)
 
     def place(self, stamp: float, keyframes: KeyframeTable, before: int | None) -> Placed | None:
-        """Return the pose of a frame. None if no path covers its stamp, or if the frame is late and none of the existing
-        pieces of the course covers it.
+        """Return the pose of a frame. Return None if no path covers the frame's stamp. Return None for a late frame if no
+        existing piece of the course covers it.
 
         before: the row of the last keyframe before the frame.
         """
@@ -185,10 +188,11 @@ class Course:
         return placed
 
     def by_localization(self, stamp: float, piece: int) -> tuple[Floats, Floats] | None:
-        """Return map_T_base (4, 4) of a frame by the localisation, and the drift (6, 6) of the odometry since then.
+        """Return map_T_base (4, 4) of a frame by the localisation, and the drift (6, 6) of the odometry since the localised
+        pose.
 
         The odometry of the piece of the frame leads from the newest localised pose to the frame, unless the localisation has
-        reached it. None if one of the two paths has no such poses.
+        reached it. Return None if one of the two paths has no such poses.
         """
         then = min(stamp, self.localization.newest)
         on = self.localization.at(then)
@@ -227,8 +231,8 @@ class Course:
     ) -> _Piece:
         """Return the piece of the course that puts `pose` (4, 4) of the path at start_T_base (4, 4) on the course.
 
-        own: (6, 6) drift of the path at `pose`. drift: (6, 6) drift of the course at start_T_base. noise: (rad, m) by which
-        the two poses may differ.
+        own: (6, 6) drift of the path at `pose`. drift: (6, 6) drift of the course at start_T_base. noise: (rad, m) the
+        standard deviations by which the two poses may differ.
         """
         start_T_path = start_T_base @ inverse(pose)
         to_start, to_base = adjoint(start_T_path), adjoint(start_T_base)

@@ -15,8 +15,8 @@ from objslam.live.mapper.tracks import Track
 _NOVELTY_WEIGHT = 0.02  # The weight of one frame in MapState.novelty. A larger weight adapts sooner, with more noise.
 
 _NEAR_BOX = np.cos(np.radians(20.0))
-"""The cosine of the largest angle from a box to a landmark whose body is seen there. A smaller angle saves time. Where a
-pose is so uncertain that a box farther away may match, bodies do not matter."""
+"""The cosine of the largest angle, 20 degrees, between a landmark and a box of its label if the landmark's body is used. A
+smaller angle saves time. If a pose is so uncertain that a more distant box may match, bodies do not matter."""
 
 
 def associate(
@@ -24,9 +24,9 @@ def associate(
 ) -> LandmarkUpdate:
     """Assign the rays of the newest keyframe to landmarks and tracks, and add the rays of landmarks to the graph.
 
-    rays: of the keyframe. map_T_camera: (4, 4) predicted camera pose, with its `uncertainty`. predicted: the result of
-    `predict_landmarks`, or None to compute it here. Rays that match nothing begin tracks. Second boxes of
-    a thing (`first_boxes`) and boxes of things that move are only kept for the end of the session.
+    rays: the rays of the keyframe. map_T_camera: (4, 4) predicted camera pose, with its `uncertainty`. predicted: the result
+    of `predict_landmarks`, or None to compute it here. Rays that match nothing begin tracks. Second boxes of a thing
+    (`first_boxes`) and boxes of things that move are only kept for the end of the session.
     """
     landmarks, settings, k, count = m.landmarks, m.settings.association, int(m.keyframes.id[-1]), len(rays.label)
     one = may_be_one(rays.box, rays.label)
@@ -97,17 +97,18 @@ def associate(
 
 
 def _shown_twice(label: Ints, one: Bools) -> list[int]:
-    """Return the labels of which a frame shows two things. label: (n,) of its boxes. one: (n, n) as in `may_be_one`."""
+    """Return the labels of which a frame shows two things. label: (n,) the labels of its boxes. one: (n, n) as in
+    `may_be_one`."""
     first, _ = np.nonzero(np.triu(label[:, None] == label, 1) & ~one)
     return sorted(set(label[first].tolist()))
 
 
 def first_boxes(score: Floats, one: Bools) -> Ints:
-    """Return the boxes that may match something or begin a track: the surest of the boxes that may show one thing.
+    """Return the boxes that may match something or begin a track. Of the boxes that may show one thing, only the surest may.
 
-    A second box of a thing would become a second landmark, or pull the first one aside. A thing that stands behind another
-    of its label loses some boxes, but has others from where the robot sees them side by side. The end of the session uses
-    all boxes. score: (n,). one: (n, n) as in `may_be_one`.
+    A second box of a thing would become a second landmark, or pull the first landmark aside. A thing that stands behind
+    another thing of its label loses some boxes. It keeps the boxes from places where the robot sees both things side by
+    side. The end of the session uses all boxes. score: (n,). one: (n, n) as in `may_be_one`.
     """
     first = np.zeros(len(score), dtype=bool)
     for i in np.argsort(-score, kind="stable").tolist():
@@ -116,9 +117,9 @@ def first_boxes(score: Floats, one: Bools) -> Ints:
 
 
 def _box_centres(m: MapState, rays: FrameRays, map_T_camera: Floats) -> tuple[Floats, Floats]:
-    """Return `box_centres` (N, 3) and (N,) of all landmarks for the newest keyframe, whose camera pose is (4, 4).
+    """Return the two arrays (N, 3) and (N,) of `box_centres` for all landmarks in the newest keyframe.
 
-    A landmark that is far from the boxes of its label (`_NEAR_BOX`) has the vector 0.
+    A landmark that is far from the boxes of its label (`_NEAR_BOX`) has the vector 0. map_T_camera: (4, 4) of the keyframe.
     """
     landmarks = m.landmarks
     beside, sigma = np.zeros((len(landmarks), 3)), np.zeros(len(landmarks))

@@ -19,11 +19,11 @@ _VIEW = np.cos(np.radians(40.0))  # The cosine of the largest angle from a box t
 _BEYOND = 1.5  # Candidates are within this multiple of the largest observed distance. A larger factor costs time.
 _NEAR = 10.0  # Landmarks in view and nearer than this (m) are always candidates. A larger distance costs time.
 _ROUGH = 3.0
-"""A candidate is rough if the image area of its uncertainty is more than this many times the image area of a ray's noise.
-With a larger value, fewer candidates are rough."""
+"""The ratio between the image area of a candidate's uncertainty and the image area of a ray's noise above which the
+candidate is rough. With a larger value, fewer candidates are rough."""
 _CLEAR = 6.0  # The least cost difference of the two best candidates, if both are rough. A larger value matches fewer rays.
 _WIDEST = 0.3  # The uncertainty (m) above which a rough candidate is dropped. A larger value matches more boxes.
-_BY_LABEL = 4.0  # The gate is this factor wider if every label is one object. A larger factor keeps more rays after a drift.
+_BY_LABEL = 4.0  # The factor on the gate if every label is one object. A larger factor keeps more rays after a drift.
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class FrameRays:
     """The rays of the usable boxes of one frame.
 
     direction: (n, 3) unit vectors in the camera frame. sigma: (n,) rad. range, range_sigma: (n,) m, NaN if unknown. label:
-    (n,) the numbers of the labels. score: (n,). box: (n, 4) px. size: (n, 2) width and height per metre of the distance, 0
-    if the camera sees no sizes. track: (n,) the track ids of the detector, -1 if unknown.
+    (n,) the numbers of the labels. score: (n,). box: (n, 4) px. size: (n, 2) width and height in m per m of distance, 0 if
+    the camera sees no sizes. track: (n,) the track ids of the detector, -1 if unknown.
     """
 
     direction: Floats
@@ -50,7 +50,7 @@ class FrameRays:
         return FrameRays(**{name: value[rays] for name, value in vars(self).items()})
 
     def turned(self, added: Floats, sigma: Floats) -> FrameRays:
-        """Return the rays with `added` (n, 3) added to their directions. sigma: (n,) rad, the noise of `added`."""
+        """Return the rays with `added` (n, 3) added to the directions. sigma: (n,) rad, the noise of `added`."""
         direction = self.direction + added
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         return replace(self, direction=direction, sigma=np.hypot(self.sigma, sigma))
@@ -69,9 +69,9 @@ def match(
     """Return the index in `predicted` of the landmark or track of each ray (n,), -1 for a ray without one.
 
     `long_unseen` tracks are excluded, unless the camera pose in the map is certain. Long unseen landmarks must be compatible
-    with each other (`jointly_compatible`). map_T_camera: (4, 4) predicted camera pose, with its `uncertainty`. labels:
-    number of labels. gate: share of the right matches that pass the gate. landmark_of_track: id of the last landmark of each
-    detector track. novelty: recent share of boxes without a landmark.
+    with each other (`jointly_compatible`). map_T_camera: (4, 4) predicted camera pose, with its `uncertainty`. labels: the
+    number of labels. gate: the share of the right matches that pass the gate. landmark_of_track: the id of the last landmark
+    of each detector track. novelty: the recent share of boxes that match no landmark.
     """
     obs, origin, count = in_map(rays, map_T_camera), map_T_camera[:3, 3], len(rays.label)
     unseen = long_unseen(uncertainty.drift, predicted.drift)
@@ -138,7 +138,7 @@ def best_of_label(rays: FrameRays) -> Ints:
 
 
 def in_map(rays: FrameRays, map_T_camera: Floats, which: Ints | slice = slice(None)) -> Observations:
-    """Return rays as observations in map. map_T_camera: (4, 4). which: the indices of the rays to return."""
+    """Return rays as observations in the frame `map`. map_T_camera: (4, 4). which: the indices of the rays to return."""
     direction = rays.direction[which] @ map_T_camera[:3, :3].T
     origin = np.broadcast_to(map_T_camera[:3, 3], direction.shape)
     lines = Observations.of_lines(
@@ -166,8 +166,8 @@ def _possible(
 def _best(edges: Edges, cost: Floats, rays: int, places: int, unmatched: float) -> Ints:
     """Return the candidate of each ray (n,), or -1, in the assignment with the least total cost.
 
-    cost: (E,) of the edges, which may be negative. rays, places: the numbers of rays and of candidates. unmatched: the cost
-    of a ray without a candidate.
+    cost: (E,) the costs of the edges, which may be negative. rays, places: the numbers of rays and of candidates. unmatched:
+    the cost of a ray without a candidate.
     """
     useful = np.flatnonzero(cost < unmatched)
     ray, place = pair_up(edges.ray[useful], edges.landmark[useful], unmatched - cost[useful], (rays, places))
@@ -185,7 +185,8 @@ def _with_sizes(edges: Edges, obs: Observations, usual: UsualSizes, to: Floats, 
 
     Sizes only decide between such landmarks, so the least cost of a box is subtracted from all costs of this box. A
     candidate without a size would otherwise win the box of a landmark that is badly placed, and become its duplicate. usual:
-    the sizes of the m candidates. to: (m, 3) m, from the camera to them. spread: (m, 3, 3) m^2, its covariance.
+    the sizes of the m candidates. to: (m, 3) m, from the camera to the candidates. spread: (m, 3, 3) m^2, the covariance of
+    `to`.
     """
     sized = usual.number[edges.landmark] >= SIZED_BY
     several = np.bincount(edges.ray[sized], minlength=len(obs)) > 1
@@ -206,8 +207,8 @@ def _with_sizes(edges: Edges, obs: Observations, usual: UsualSizes, to: Floats, 
 def _clear(edges: Edges, sigma: Floats, to: Floats, landmark: Bools) -> Edges:
     """Remove matches with rough landmarks (_ROUGH) if they are ambiguous (_CLEAR) or too uncertain (_WIDEST).
 
-    Loop closure may match these landmarks later. sigma: (n,) rad, of the rays. to: (m, 3) m from the camera to each
-    candidate. landmark: (m,) False for a track.
+    Loop closure may match these landmarks later. sigma: (n,) rad, the noise of the rays. to: (m, 3) m from the camera to
+    each candidate. landmark: (m,) False for a track.
     """
     rough = (edges.vague > 2 * np.log(_ROUGH)) & landmark[edges.landmark]
     if not rough.any():

@@ -6,7 +6,7 @@ from objslam.core.arrays import Bools, Ints
 from objslam.live.mapper.localization import chain_keyframes
 from objslam.live.mapper.state import MapState
 
-_NEWEST = 1 / 3  # The newest keyframes that stay, as a share of live.max_keyframes. A larger share removes more old ones.
+_NEWEST = 1 / 3  # The newest keyframes that stay, as a share of live.max_keyframes. With a larger share, more old ones go.
 _OLDEST = 1 / 30  # The oldest keyframes that stay, as a share of live.max_keyframes. They tie the map to its start.
 _SHARE = 0.25  # The share of live.max_keyframes that one culling removes. A larger share makes culling rarer and longer.
 _AGAIN = 0.1  # New keyframes before the next culling, as a share of live.max_keyframes. A larger share culls less often.
@@ -16,7 +16,7 @@ _CROWDED = 1.2  # If _ENOUGH keeps more than this times live.max_keyframes, _LEA
 
 
 def cull_keyframes(m: MapState) -> None:
-    """Remove old keyframes if there are more than live.max_keyframes. Begin where they are closest together.
+    """Remove old keyframes if the map has more than live.max_keyframes. Begin where keyframes are closest together.
 
     One call never removes two consecutive keyframes. The motions before and after a removed keyframe become one motion. The
     next culling waits for some new keyframes (_AGAIN).
@@ -46,7 +46,7 @@ def cull_keyframes(m: MapState) -> None:
 
 
 def _dispensable(m: MapState, order: Ints, wanted: int, fewest: int) -> Bools:
-    """Return a mask (K,) of the keyframes to remove, in time order. At most `wanted` are removed.
+    """Return a mask (K,), in time order, of the keyframes to remove. It selects at most `wanted` keyframes.
 
     Every landmark keeps at least `fewest` rays, unless it has fewer already. order: (K,) rows in time order.
     """

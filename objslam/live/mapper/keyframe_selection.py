@@ -13,8 +13,8 @@ _STANDING = 10  # The most keyframes of one stop, without new labels. More of th
 class KeyframeSelector:
     """Selects a keyframe when a camera has moved by a set distance or angle, and a few keyframes while the cameras stand.
 
-    The methods share their arguments. camera: the number of the camera. start_T_camera: (4, 4) its pose on the course.
-    shown: the numbers of the labels in the frame.
+    The methods share their arguments. camera: the number of the camera. start_T_camera: (4, 4) the camera's pose on the
+    course. shown: the numbers of the labels in the frame.
     """
 
     def __init__(self, settings: Live) -> None:
@@ -24,7 +24,8 @@ class KeyframeSelector:
         self._standing = 0
 
     def is_redundant(self, camera: int, start_T_camera: Floats, shown: set[int]) -> bool:
-        """Return whether a frame adds nothing: its camera stands, and enough keyframes since it stopped show its labels."""
+        """Return whether a frame adds nothing: its camera stands, and enough keyframes since the camera stopped show its
+        labels."""
         seen_before = shown <= self._shown and self._standing >= _STANDING
         return seen_before and not self._has_moved(camera, start_T_camera)
 
@@ -40,8 +41,8 @@ class KeyframeSelector:
         self._last[camera] = start_T_camera
 
     def pass_over(self, camera: int, start_T_camera: Floats) -> None:
-        """Register a frame that is neither redundant nor a keyframe. If its camera has moved since its last keyframe, it no
-        longer counts as standing."""
+        """Register a frame that is neither redundant nor a keyframe. If the camera has moved since its last keyframe, the
+        camera no longer counts as standing."""
         if self._has_moved(camera, start_T_camera):
             self._shown.clear()
             self._standing = 0

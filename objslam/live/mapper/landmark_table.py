@@ -1,8 +1,8 @@
 """The table of landmarks, with their covariances, their noise, and the landmarks that a camera should see.
 
-The centre of a box is not the image of the centre of its object. For large objects nearby, this error would bend the path of
-the session. So the landmark of such an object is the centre of its body. The boxes of a frame are matched with the centres
-of predicted boxes. The bearings of matched boxes are then turned to the centres of bodies.
+The centre of a box is not the image of the object's centre. For large objects nearby, this error would bend the path of the
+session. So the landmark of such an object is the centre of the object's body. The boxes of a frame are matched with the
+centres of predicted boxes. The bearings of matched boxes are then turned to the centres of bodies.
 """
 
 import math
@@ -22,29 +22,29 @@ from objslam.live.mapper.tables import GrowingTable, column
 from objslam.live.mapper.tracks import Track
 
 _FLOOR = 0.01  # The standard deviation (m) added to each position. A larger value keeps old landmarks less certain.
-_HELD = 1e-4  # Information (m^-2) that keeps covariances of parallel rays finite. A larger value makes them too small.
-_INNER = 0.05  # The border in which boxes may be cut off, as a share of the image. A larger share expects fewer landmarks.
+_HELD = 1e-4  # Information (m^-2) that keeps covariances of parallel rays finite. A larger one makes them too small.
+_INNER = 0.05  # The border where boxes may be cut off, as a share of the image. A larger share expects fewer landmarks.
 _NEAREST = 0.3
-"""The distance (m) below which an object does not fit into the image and is not expected to be seen. A larger distance
-expects fewer landmarks."""
-_FURTHER = 1.1  # A landmark is expected up to this factor times its `far`. A larger factor counts more misses.
+"""The distance (m) below which an object does not fit into the image. A frame is not expected to show a nearer landmark.
+With a larger distance, fewer landmarks are expected."""
+_FURTHER = 1.1  # Landmarks are expected up to this factor times their `far`. A larger factor counts more misses.
 _NO_ID = -2  # The id of every track among the predicted landmarks. No landmark has this id, and -1 means no landmark.
 
 
 class LandmarkTable(GrowingTable):
     """The landmarks in the order of their ids.
 
-    position: m, in map. information: m^-2, from the rays. drift: odometry drift at the last observation. first, last:
-    stamps, s, of the first and last observation. label: number. seen: number of frames that showed the landmark. expected:
-    number of frames that should have shown it. far: m, the largest observed distance. squared: sum of the squared normalised
-    residuals of its rays, clipped. rejected: number of its rays outside the gate.
+    position: m, in map. information: m^-2, of the position, from the rays. drift: odometry drift at the last observation.
+    first, last: stamps, s, of the first and last observation. label: number of the label. seen: number of frames that showed
+    the landmark. expected: number of frames that should have shown it. far: m, the largest observed distance. squared: sum
+    of the squared normalised residuals of its rays, clipped. rejected: number of its rays outside the gate.
 
-    sized, ln_size, size_variance: the number and the usual size of its boxes, as in `UsualSizes`. measured,
-    measured_at: `seen` and `position` when they were last measured.
+    sized, ln_size, size_variance: the number of the landmark's boxes and their usual size, as in `UsualSizes`. measured,
+    measured_at: the values of `seen` and `position` when the usual size was last measured.
 
-    shape: of the body to whose centre the bearings point, as an index into `core.bodies.body.SHAPES`. 0 means that they
-    point to the centres of boxes. half, yaw: m and rad, the half axes and the heading of this body. shape_covariance: of
-    these four numbers.
+    shape: the shape of the body to whose centre the bearings point, as an index into `core.bodies.body.SHAPES`. 0 means that
+    the bearings point to the centres of boxes. half: m, the half axes of this body. yaw: rad, its heading. shape_covariance:
+    the covariance of `half` and `yaw`.
     """
 
     id: Ints = column(np.int64)
@@ -71,7 +71,7 @@ class LandmarkTable(GrowingTable):
 
 
 def noise(landmarks: LandmarkTable, rows: Ints) -> Floats:
-    """Return the factor (n,) on the nominal noise of the rays of each landmark, from their residuals."""
+    """Return a factor (n,) for each landmark: the noise of its rays by their residuals, divided by their nominal noise."""
     seen = landmarks.seen[rows] + POOLED_WITH_PROMISE
     return np.sqrt((landmarks.squared[rows] / 2 + POOLED_WITH_PROMISE) / seen).clip(*NOISE_FACTORS)
 
@@ -84,8 +84,8 @@ def covariances(landmarks: LandmarkTable, rows: Ints) -> Floats:
 def in_view(
     landmarks: LandmarkTable, camera: Camera, map_T_camera: Floats, margin: float = _INNER, reach: float = 0.0
 ) -> Bools:
-    """Return which landmarks (N,) a camera should see. They are in its image, and not much further away than in any
-    observation.
+    """Return which landmarks (N,) a camera should see. Such a landmark is in the image, and not much further away than its
+    furthest observation.
 
     map_T_camera: (4, 4). margin: the share of the image along its edge that is excluded. A negative margin extends the
     image. reach: m, the distance up to which every landmark should be seen.
@@ -133,11 +133,11 @@ def _sizes(landmarks: LandmarkTable, more: int) -> UsualSizes:
 def box_centres(
     landmarks: LandmarkTable, rows: Ints, cameras: Sequence[Camera], camera: Ints, map_T_camera: Floats
 ) -> tuple[Floats, Floats]:
-    """Return vectors (n, 3), m, from landmarks to points on the rays through the centres of their boxes, and their noise
-    (n,), m.
+    """Return vectors (n, 3), m, from landmarks to points on the rays through the centres of their boxes. The second array
+    (n,), m, is the noise of these vectors.
 
-    The noise comes from the bodies. A landmark without a body has the vector 0. rows: (n,) of the landmarks. camera: (n,)
-    the number of the camera of each. map_T_camera: (n, 4, 4).
+    The noise comes from the bodies. A landmark without a body has the vector 0. rows: (n,) the rows of the landmarks.
+    camera: (n,) the number of the camera for each landmark. map_T_camera: (n, 4, 4).
     """
     beside, sigma = np.zeros((len(rows), 3)), np.zeros(len(rows))
     some = np.flatnonzero(landmarks.shape[rows])
@@ -152,7 +152,7 @@ def box_centres(
 
 
 def at_box_centres(predicted: PredictedLandmarks, beside: Floats, sigma: Floats) -> PredictedLandmarks:
-    """Return the candidates for the boxes of a frame, with landmarks where the centres of their boxes would be.
+    """Return the candidates for the boxes of a frame, with each landmark moved to where the centre of its box would be.
 
     beside: (N, 3) m and sigma: (N,) m, of all landmarks, as `box_centres` returns them.
     """
@@ -166,10 +166,12 @@ def at_box_centres(predicted: PredictedLandmarks, beside: Floats, sigma: Floats)
 
 
 def to_centres(to: Floats, beside: Floats, sigma: Floats, map_R_camera: Floats) -> tuple[Floats, Floats]:
-    """Return what to add (n, 3) to unit bearings through centres of boxes, so that they point to the centres of bodies.
+    """Return vectors (n, 3) to add to unit bearings through centres of boxes, so that the bearings point to the centres of
+    bodies.
 
-    The vectors are in the camera frame. The second array (n,) is their noise, rad. to: (n, 3) m, from the camera to each
-    landmark. beside: (n, 3) m and sigma: (n,) m, as `box_centres` returns them. map_R_camera: (n, 3, 3) or (3, 3).
+    The vectors are in the camera frame. The second array (n,) is the noise of the vectors, rad. to: (n, 3) m, from the
+    camera to each landmark. beside: (n, 3) m and sigma: (n,) m, as `box_centres` returns them. map_R_camera: (n, 3, 3) or
+    (3, 3).
     """
     away, shown = np.sqrt((to * to).sum(axis=1)), to + beside
     added = to / away[:, None] - shown / np.sqrt((shown * shown).sum(axis=1))[:, None]

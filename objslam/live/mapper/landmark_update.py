@@ -14,24 +14,26 @@ from objslam.live.mapper.landmark_table import in_view
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
-_JUMP = np.radians(2.0)  # The residual (rad) above which the graph relinearises soon. A larger one relinearises more rarely.
+_JUMP = np.radians(2.0)  # The residual (rad) above which the graph is soon relinearised. With a larger one, this is rarer.
 _GROWN = 1.2
-"""The size of a landmark's boxes is measured again when its observations have grown by this factor. With a larger factor,
-the size is older, and takes less time."""
+"""The factor by which the number of a landmark's observations grows before the size of its boxes is measured again. With a
+larger factor, sizes are older, and measuring them takes less time."""
 _MOVED = 0.05
-"""The size is also measured again when the landmark has moved by this share of its distance from the camera, because a box
-on a farther landmark shows a larger thing. With a larger share, the size is older."""
+"""The motion of a landmark, as a share of its distance from the camera, after which the size of its boxes is measured again.
+The size depends on the distance, because an equal box at a larger distance shows a larger thing. With a larger share, sizes
+are older."""
 _BOXES = 20
-"""The most boxes of a landmark for its size, spread evenly over its boxes. More boxes take longer."""
+"""The most boxes that give the size of one landmark. They are spread evenly over all boxes of the landmark. More boxes take
+longer."""
 _TRACKS = 4096  # The detector tracks whose landmark is stored. A larger number knows a track id after a longer absence.
 
 
 @dataclass(frozen=True)
 class LandmarkUpdate:
-    """The observations of the newest keyframe, which are in the graph already.
+    """The observations of the newest keyframe, which are already in the graph.
 
-    rays: all rays of its frame. Rays to bodies are turned to their centres. matched: (m,) the indices of rays with a
-    landmark. rows: (m,) the rows of their landmarks in the table. tracks: all tracks with a ray of the frame.
+    rays: all rays of the frame. Rays of landmarks with a body are turned to the body's centre. matched: (m,) the indices of
+    rays with a landmark. rows: (m,) the rows of these landmarks in the table. tracks: all tracks with a ray of the frame.
     """
 
     rays: FrameRays
@@ -41,8 +43,8 @@ class LandmarkUpdate:
 
 
 def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
-    """Count which landmarks the newest keyframe should show, and which it shows. Update the landmarks that it shows by its
-    rays."""
+    """Count which landmarks the newest keyframe should show, and which landmarks it shows. Update the shown landmarks by
+    their new rays."""
     landmarks, keyframes, rays, rows = m.landmarks, m.keyframes, update.rays, update.rows
     pose = m.graph.pose(int(keyframes.id[-1]))
     seen = in_view(landmarks, m.cameras[keyframes.camera[-1]], pose)
@@ -79,7 +81,8 @@ def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
 
 
 def observed(obs: Observations, position: Floats) -> dict[str, Floats | float]:
-    """Return the columns of a landmark at a position (3,) that follow from its rays. obs: the rays in map, all inliers."""
+    """Return the columns of a landmark at a position (3,) that follow from its rays. obs: the rays, all inliers, in the
+    frame map."""
     return {
         "position": position,
         "information": information(obs, position).sum(axis=0),

@@ -13,7 +13,7 @@ from objslam.live.mapper.state import MapState
 
 
 def localize(m: MapState) -> bool:
-    """Add absolute poses to the pending keyframes that the localisation covers by now. Return whether the map moved.
+    """Add absolute poses to the pending keyframes that the localisation now covers. Return whether the whole map moved.
 
     The first absolute pose moves the whole map, because odometry alone gives the map relative to its own start.
     """
@@ -47,10 +47,11 @@ def localize(m: MapState) -> bool:
 
 
 def _place(m: MapState, row: int) -> None:
-    """Add the absolute pose of the newest localised keyframe, and the motion that the localisation measures up to it.
+    """Add the absolute pose of the newest localised keyframe, and the motion that the localisation measures up to this
+    keyframe.
 
     If errors last, each pose has a part of the information that all poses have together. This part depends on the times of
-    the poses before and after. The time until the next pose is taken to be the time since the one before.
+    the poses before and after. The time until the next pose is assumed to equal the time since the previous pose.
     """
     k, others = m.keyframes, m.keyframes.localized.copy()
     others[row] = False
@@ -84,9 +85,9 @@ def place_keyframes(m: MapState) -> None:
 def chain_keyframes(m: MapState) -> None:
     """Connect consecutive keyframes by their motion. The caller must rebuild the graph.
 
-    A motion that the odometry did not measure is from the localisation, if its errors last. If there is no such motion
-    either, a weak factor replaces it. No factor is needed if the later keyframe and some earlier keyframe are localised,
-    because their absolute poses relate the two.
+    If the odometry did not measure a motion, the motion comes from the localisation, provided that the errors of the
+    localisation last. Without such a motion, a weak factor replaces it. No factor is needed if the later keyframe and some
+    earlier keyframe are localised, because the absolute poses relate them.
     """
     k, order = m.keyframes, m.time_order()
     every = m.keyframe_arrays(order)

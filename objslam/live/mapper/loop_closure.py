@@ -1,4 +1,4 @@
-"""Loop closure: landmarks seen now are recognised as landmarks seen long ago, several at once, and merged."""
+"""Closes loops. Several landmarks seen now are recognised together as landmarks seen long ago, and are merged with them."""
 
 from contextlib import suppress
 
@@ -16,21 +16,21 @@ from objslam.live.mapper.landmark_update import merge_landmarks, remove_landmark
 from objslam.live.mapper.pose_uncertainty import gathered, long_unseen
 from objslam.live.mapper.state import MapState
 
-_ANCHORS = 3  # How many past keyframes are tried as the start of the loop. More keyframes take longer.
+_ANCHORS = 3  # The number of past keyframes that are tried as the start of the loop. More keyframes take longer.
 _NEAR = 0.25  # A correction above this (m) bends the path before landmarks merge. A larger value leaves more to iSAM2.
 _TURNED = 0.05  # A heading correction above this (rad) bends the path before landmarks merge, as a shift above _NEAR does.
 _AROUND = 6.0
-"""Other landmarks within this radius (m) of recognised landmarks match again. Cameras see about as far in a hall. In a
-larger radius, more landmarks match again."""
-_ERA = 15.0  # Landmarks _AROUND match again if seen within this time (s) of the recognised ones. A longer time matches more.
+"""The radius (m) around recognised landmarks in which other landmarks match rays again. Cameras see about as far in a hall.
+In a larger radius, more landmarks match again."""
+_ERA = 15.0  # The time (s) from the sight of recognised landmarks in which those _AROUND match. A longer time matches more.
 _ITERATIONS = 5  # The most iterations of the solve after a loop closure. More iterations delay the next frame.
-_TOLERANCE = 1e-3  # The share of the cost below whose decrease the solve gives up. A smaller value takes longer.
+_TOLERANCE = 1e-3  # The relative decrease of the cost below which the solve gives up. A smaller value takes longer.
 _HOLDS = 0.7  # The share of a loop's rays that must be inliers. A larger share undoes more loops, right and wrong ones.
 _BENT = 0.02  # The assumed error (m) of the corrected path, added to the noise of rays. A larger error accepts more rays.
 
 
 def close_loop(m: MapState) -> None:
-    """Search for a loop and close it. The map is restored if too many rays contradict the loop afterwards."""
+    """Search for a loop and close it. If too many rays then contradict the loop, the map is restored."""
     landmarks = m.landmarks
     newest = int(np.argmax(m.keyframes.stamp))
     there = long_unseen(m.keyframes.drift[newest], landmarks.drift)
@@ -52,10 +52,11 @@ def close_loop(m: MapState) -> None:
 def _recognise(
     m: MapState, one: Ints, two: Ints, possible: Bools, newest: int, together: Bools
 ) -> place_recognition.Recognition | None:
-    """Return how the landmarks in rows `one` are sure to be those in rows `two`, None if they are not.
+    """Return how the landmarks in rows `one` surely match the landmarks in rows `two`, or None without a sure match.
 
-    They have to match better than landmarks that some frame shows `together` (N, N), because such places repeat themselves.
-    possible: which pairs may be the same. newest: the row of the newest keyframe.
+    The match must be better than matches between landmarks that some frame shows `together` (N, N). Such landmarks are
+    different, and match only because places look alike. possible: which pairs may be the same. newest: the row of the newest
+    keyframe.
     """
     landmarks, k = m.landmarks, m.keyframes
     pivot = m.graph.pose(int(k.id[newest]))[:2, 3]
@@ -89,7 +90,7 @@ def _recognise(
 def _planar(m: MapState, before: int, now: int) -> Floats:
     """Return a fast upper bound (3, 3) on the covariance of x, y (m) and yaw (rad) between keyframes in two rows.
 
-    It is the smaller of two bounds: the drift between the keyframes, and the uncertainty of the newest pose in the map.
+    It is the smaller of two bounds. One is the drift between the keyframes, the other the uncertainty of the newest pose.
     """
     k = m.keyframes
     turn = np.kron(np.eye(2), m.graph.pose(int(k.id[now]))[:3, :3])
@@ -131,9 +132,9 @@ def _merge(m: MapState, now: Ints, old: Ints, rebuild: bool = True) -> None:
 
 
 def _expect_around(m: MapState, now: Ints, old: Ints) -> None:
-    """Let the landmarks around the rows `old` (P,) match rays again, although they are long unseen.
+    """Let the long unseen landmarks around the landmarks in rows `old` (P,) match rays again.
 
-    They get the drift of the first seen landmark in rows `now` (P,), as if they had been last seen with it.
+    Each gets the drift of the first seen landmark in rows `now` (P,), as if the two had been last seen together.
     """
     landmarks = m.landmarks
     drift = landmarks.drift[now[np.argmin(landmarks.first[now])]]
@@ -148,7 +149,7 @@ def _expect_around(m: MapState, now: Ints, old: Ints) -> None:
 def _bend(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
     """Distribute the correction over the path, merge rows `now` (P,) into `old` (P,), and solve the map.
 
-    If too few rays are inliers after that, restore the old map.
+    If too few rays are then inliers, restore the old map.
     """
     landmarks, k, rays = m.landmarks, m.keyframes, m.rays
     m.graph.refresh()
@@ -188,8 +189,8 @@ def _bend(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
 def _settles(m: MapState, mine: Ints) -> bool:
     """Solve the corrected graph until the rays in rows `mine` (n,) hold, and return whether they do.
 
-    After one step on the Bayes tree, iterations of Levenberg-Marquardt follow. The next frame waits for all of them, so they
-    end as soon as the rays hold. Later relinearisations do the rest.
+    After one step on the Bayes tree, iterations of Levenberg-Marquardt follow. The next frame waits for all iterations, so
+    they end as soon as the rays hold. Later relinearisations complete the solve.
     """
     with suppress(SolveError):
         m.graph.rebuild()

@@ -25,31 +25,31 @@ from objslam.mapping.joint.labels import MANY, SECOND
 _EVERY = 10  # The period of every task in keyframes. A larger period keeps duplicates and false landmarks for longer.
 _GROWING = 3  # The keyframe of each period after which tracks and keyframes are dropped and all rays are tested.
 _CLOSING = 6  # The keyframe of each period for merging and removing landmarks. It differs from _GROWING to spread delay.
-_QUIET = 9  # The keyframe of each period without a task. It is odd, so that no relinearisation of `_BREATH` is due either.
+_QUIET = 9  # The keyframe of each period without a task. It is odd, because relinearisations (`_BREATH`) are at even ones.
 _BREATH = 2  # The period of relinearisations after a large change, in keyframes. A larger period settles the map later.
 _FIRST = 20  # The number of keyframes at the first full solve. Fewer keyframes have too few rays of any landmark.
-_GROWTH = 1.5  # A full solve follows when keyframes have grown by this factor. A larger one keeps early errors longer.
+_GROWTH = 1.5  # The growth factor of keyframes between full solves. A larger factor keeps early errors longer.
 _ITERATIONS = 8  # The most iterations of a full solve. More iterations delay the next frame.
 _LARGE = 200  # With more keyframes, a rebuild in slices replaces the full solve. A larger number delays the next frame more.
 _ODDS = 2.5  # The least log odds that two landmarks are one object, not two neighbours. Larger odds leave more duplicates.
 _HALF = 0.5  # The share of inliers below which a landmark is triangulated again. A larger share redoes more landmarks.
 _VISITS = 6
-"""The least number of changes between inliers and outliers, in time order, that shows two objects of a label. Drift makes
-one run of outliers, which has two changes. A larger number needs more visits to both objects."""
+"""The least number of changes between inliers and outliers, in time order, that shows two objects of one label. Drift makes
+one run of outliers, which has two changes. With a larger number, both objects need more visits."""
 _DRIFT = 5.0
 """The largest assumed drift of a path, as a multiple of the drift in the settings. Real robots drift by up to 3.3 times.
 With a larger value, two objects of a label are recognised as two only if they are farther apart, or visited more often."""
 _DISTANT = 60.0  # The time (s) after which an unseen track with enough rays is dropped. A larger time keeps more tracks.
-_AROUND = 0.15  # The camera may soon see this share of the image beyond its edge. A larger share prepares more landmarks.
-_USUAL = 0.75  # Every landmark may be seen up to this quantile of all `far`. A larger value prepares more landmarks.
+_AROUND = 0.15  # The border outside the image that is soon seen, as a share of it. A larger share prepares more landmarks.
+_USUAL = 0.75  # The quantile of all `far` up to which any landmark is soon seen. A larger value prepares more landmarks.
 
 
 @dataclass(frozen=True)
 class _SecondObject:
     """Another object of the label of a landmark.
 
-    row: of the landmark. rays: (n,) the rows of the rays that show it. fit: its position. obs: these rays in map. far:
-    whether no drift of the path explains its distance from the landmark.
+    row: the row of the landmark. rays: (n,) the rows of the rays that show the other object. fit: the position of the other
+    object. obs: these rays in the frame map. far: whether no drift of the path explains its distance from the landmark.
     """
 
     row: int
@@ -60,7 +60,8 @@ class _SecondObject:
 
 
 def is_quiet(number: int) -> bool:
-    """Return whether no task is due at a keyframe. Then the next frame waits less for work that may be done at any time."""
+    """Return whether no task is due at a keyframe. At such a keyframe, work that may be done at any time delays the next
+    frame less."""
     return number % _EVERY == _QUIET
 
 
@@ -99,8 +100,8 @@ def _coming(m: MapState) -> Ints:
 def _polish_if_grown(m: MapState) -> None:
     """If the graph has grown by `_GROWTH`, solve it, and test which rays are outliers.
 
-    A large graph is not solved here, but rebuilt in slices. A graph is also rebuilt if the test finds other outliers than
-    before.
+    A large graph is not solved here, but rebuilt in slices. A graph is also rebuilt if the test changes which rays are
+    outliers.
     """
     if m.next_id.keyframe < max(_FIRST, _GROWTH * m.schedule.solved) or not len(m.landmarks):
         return
@@ -127,7 +128,7 @@ def _reconsider(m: MapState) -> tuple[bool, list[_SecondObject]]:
     """Reject rays that are outliers now, and restore rejected rays that are inliers now.
 
     The landmark of a name is triangulated again if few of its rays are inliers. If the rays of a name show two objects, it
-    becomes a class. Return whether any ray changed, and these second objects.
+    becomes a class. Return whether any ray changed, and the second objects.
     """
     second: list[_SecondObject] = []
     rays, landmarks = m.rays, m.landmarks
@@ -170,11 +171,11 @@ def _reconsider(m: MapState) -> tuple[bool, list[_SecondObject]]:
 def _second_objects(
     m: MapState, obs: Observations, held: Ints, row: Ints, support: Bools, named: Bools
 ) -> list[_SecondObject]:
-    """Return the landmarks whose rays show two objects, each with its outliers (rows of `m.rays`) and their point.
+    """Return the second object of each landmark whose rays show two objects. Its rays are the outliers of the landmark.
 
-    If there are two objects, the outliers fit one point. In addition, inliers and outliers alternate (_VISITS), or the point
-    is farther away than the path drifts. obs: the rays, in time order. held: (R,) their rows in `m.rays`. row: (R,) the row
-    of each ray's landmark. support: (R,) which rays are inliers. named: (N,) which landmarks have a name.
+    The outliers of such a landmark fit one point. In addition, inliers and outliers alternate (_VISITS), or the point is
+    farther away than the path drifts. obs: the rays, in time order. held: (R,) their rows in `m.rays`. row: (R,) the row of
+    each ray's landmark. support: (R,) which rays are inliers. named: (N,) which landmarks have a name.
     """
     found: list[_SecondObject] = []
     against = np.bincount(row[~support], minlength=len(m.landmarks))
@@ -193,9 +194,9 @@ def _second_objects(
 
 
 def _farther_than_drift(m: MapState, j: int, fit: PointFit, inliers: Ints, outliers: Ints) -> bool:
-    """Return whether a point is so far from landmark j (row) that it is no duplicate, and no drift of the path explains it.
+    """Return whether a point is too far from landmark j (row) to be a duplicate, and too far for any drift of the path.
 
-    inliers, outliers: rows of `m.rays`. The drift counts from the inlier to the outlier that is nearest in time.
+    inliers, outliers: rows of `m.rays`. The drift is counted between the inlier and the outlier that are closest in time.
     """
     k = m.keyframes
     way = fit.position - m.landmarks.position[j]
@@ -214,7 +215,7 @@ def _farther_than_drift(m: MapState, j: int, fit: PointFit, inliers: Ints, outli
 
 
 def _separate(m: MapState, second: _SecondObject) -> None:
-    """Make a new landmark from the outliers of a landmark that show another object."""
+    """Make a new landmark from those outliers of a landmark that show another object."""
     k = m.keyframes
     rows = np.searchsorted(k.id, m.rays.keyframe[second.rays])
     last = rows[k.stamp[rows].argmax()]
@@ -260,7 +261,8 @@ def _merge_duplicates(m: MapState) -> None:
 def _one(way: Floats, spread: Floats, density: float) -> bool:
     """Return whether two landmarks are one object, and not two neighbours.
 
-    way: (3,) m, from one to the other. spread: (3, 3) m^2, the covariance of `way`. density: landmarks of the label per m^2.
+    way: (3,) m, from one landmark to the other. spread: (3, 3) m^2, the covariance of `way`. density: landmarks of the label
+    per m^2.
     """
     squared = float(way @ np.linalg.solve(spread, way))
     area = 2 * np.pi * np.sqrt(np.linalg.det(spread[:2, :2]))

@@ -1,4 +1,4 @@
-"""The mapper of a live session, which takes one message at a time. It defines the order of all changes of the map.
+"""The mapper of a live session. It takes one message at a time, and defines the order of all changes of the map.
 
 The map depends on the messages and their order only, never on the clock, so a replayed journal gives the same map.
 """
@@ -51,7 +51,7 @@ class Mapper:
         self._extractor = BearingExtractor(self.state)
         self._selector = KeyframeSelector(settings.live)
         self._predictor = PosePredictor(self.state)
-        self._predicted: PredictedLandmarks | None = None  # For the next keyframe. None if the map has moved since.
+        self._predicted: PredictedLandmarks | None = None  # The candidates of the next keyframe. None if the map has moved.
 
     def feed(self, message: Message) -> None:
         """Process a pose, a camera or a mount. Other messages change nothing."""

@@ -8,7 +8,7 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.rotation import skew
 
 HORIZON = 0.06
-"""A landmark is long unseen if the heading has drifted by more than this (rad, one sigma) since the last sight. This drift
+"""The heading drift (rad, one sigma) since a landmark's last observation above which the landmark is long unseen. This drift
 moves a landmark at 5 m by 0.3 m, perhaps onto a neighbour. With a larger value, single boxes match landmarks after a longer
 absence."""
 _PLACED = 0.1  # The sigma (m) of the camera position below which long unseen tracks match. A larger value matches more.
@@ -16,7 +16,7 @@ _PLACED = 0.1  # The sigma (m) of the camera position below which long unseen tr
 
 @dataclass(frozen=True)
 class PoseUncertainty:
-    """The uncertainty of the camera pose of a frame, in rad and m, rotation first.
+    """The uncertainty of a frame's camera pose. Covariances are in rad and m, rotation first.
 
     drift: (6, 6) covariance that the odometry has accumulated, in the frame of the course. camera_from_drift: (6, 6) adjoint
     from that frame to the camera frame. pose: (6, 6) covariance of the pose in map, in the camera frame, NaN if unknown.
@@ -35,8 +35,9 @@ class PoseUncertainty:
     def of_landmarks(self, to: Floats, then: Floats, map_T_camera: Floats) -> Floats:
         """Return the covariances (n, 3, 3), m^2, that the camera pose adds to landmarks relative to the camera.
 
-        Each is the smaller of two covariances: from the drift since the landmark was seen, and from the pose in the map.
-        to: (n, 3) m from the camera to each landmark, in map. then: (n, 6, 6) drift when each landmark was last seen.
+        Each is the smaller of two covariances. One is from the drift since the landmark was seen, the other from the pose in
+        the map. to: (n, 3) m from the camera to each landmark, in map. then: (n, 6, 6) drift when each landmark was last
+        seen.
         """
         turn = map_T_camera[:3, :3]
         lever = np.empty((len(to), 3, 6))  # The Jacobians for small motions of the camera in its own frame.
@@ -51,8 +52,9 @@ class PoseUncertainty:
     def against(self, to: Floats, then: Floats) -> Floats:
         """Return the covariance (6, 6) of the camera pose relative to several landmarks together, in the camera frame.
 
-        It is the smaller of two covariances: from the drift since the longest unseen landmark was seen, and from the pose in
-        the map. to: (n, 3) m from the camera to each landmark. then: (n, 6, 6) drift when each landmark was last seen.
+        It is the smaller of two covariances. One is from the drift since the longest unseen landmark was seen, the other
+        from the pose in the map. to: (n, 3) m from the camera to each landmark. then: (n, 6, 6) drift when each landmark was
+        last seen.
         """
         oldest = then[np.trace(then, axis1=1, axis2=2).argmin()]
         since = self.camera_from_drift @ gathered(self.drift, oldest[None])[0] @ self.camera_from_drift.T
@@ -64,7 +66,7 @@ class PoseUncertainty:
 
 
 def gathered(now: Floats, then: Floats) -> Floats:
-    """Return the drift (n, 6, 6) that accumulated since `then` (n, 6, 6) until `now` (6, 6), or 0 if `now` is earlier."""
+    """Return the drift (n, 6, 6) that accumulated from `then` (n, 6, 6) to `now` (6, 6), or 0 if `now` is earlier."""
     since = now - then
     return np.where((np.trace(since, axis1=1, axis2=2) > 0)[:, None, None], since, 0.0)
 

@@ -12,17 +12,17 @@ from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
 
 _ASK = 10
-"""Every 10th keyframe, the covariance of the pose is read from the graph, which is slow. In between, odometry noise is
-added, so the covariance is too large. With a larger number, the covariance is larger still."""
+"""The number of keyframes after which the covariance of the pose is read from the graph again, which is slow. In between,
+odometry noise is added, so the covariance is too large. With a larger number, the covariance becomes larger."""
 
 
 @dataclass(frozen=True)
 class PosePrediction:
     """The predicted camera pose (4, 4) of a frame in map, and its uncertainty.
 
-    camera_T_start: (4, 4) start of the course in the camera frame. motion: the id of the previous keyframe, the motion
-    (4, 4) from its camera to the new camera, and the covariance (6, 6) of this motion in the new camera frame. None without
-    a previous keyframe, or if the pose is from localisation.
+    camera_T_start: (4, 4) start of the course in the camera frame. motion: the id of the previous keyframe, the motion (4,
+    4) from its camera to the new camera, and the covariance (6, 6) of this motion in the new camera frame. motion is None
+    without a previous keyframe, or if the pose is from localisation.
     """
 
     map_T_camera: Floats
@@ -42,7 +42,7 @@ class PosePredictor:
     def predict(
         self, before: int | None, stamp: float, placed: Placed, base_T_camera: Floats, start_T_camera: Floats
     ) -> PosePrediction:
-        """Predict the camera pose of a frame at a stamp, s. before: row of the previous keyframe, None without one.
+        """Predict the camera pose of a frame at a stamp, s. before: the row of the previous keyframe, or None without one.
 
         base_T_camera: (4, 4) camera pose on the robot. start_T_camera: (4, 4) camera pose on the course.
         """
@@ -70,7 +70,7 @@ class PosePredictor:
         back = adjoint(camera_T_start @ k.start_T_base[before] @ k.base_T_camera[before])
         pose = back @ self.covariance_of(number) @ back.T + covariance
         uncertainty, map_T_camera = PoseUncertainty(placed.drift, camera_from_drift, pose), m.graph.pose(number) @ motion
-        # After a way without keyframes, the localisation is better than the odometry from the last of them.
+        # After a way without keyframes, the localisation is better than the odometry since the last keyframe.
         if held and not uncertainty.is_placed and (near := m.course.by_localization(stamp, placed.piece)) is not None:
             spread = variance + camera_from_drift @ near[1] @ camera_from_drift.T
             localized = PoseUncertainty(placed.drift, camera_from_drift, spread)

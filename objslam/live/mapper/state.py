@@ -25,11 +25,11 @@ from objslam.live.mapper.tables import KeyframeTable, RayTable
 from objslam.live.mapper.tracks import Track
 
 _AT_ONCE = 400
-"""The most keyframes of a graph that is solved at once after a correction of its measurements. A larger graph is rebuilt in
-slices, between frames. A larger number delays the next frame for longer."""
+"""The most keyframes of a graph that is solved at once after a correction of its measurements. A graph with more keyframes
+is rebuilt in slices, between frames. With a larger number, the next frame waits longer."""
 _ITERATIONS = 8
 """The most iterations of the solve after a correction. More iterations delay the next frame for longer."""
-_RELINEARISATIONS = 3  # The relinearisations after a large change. More let the map settle further, and take time.
+_RELINEARISATIONS = 3  # The number of relinearisations after a large change. More of them are more exact, and take longer.
 
 
 @dataclass
@@ -46,8 +46,8 @@ class NextIds:
 class LocalizationState:
     """The state of the localisation. pending: the ids of the keyframes that wait for a localised pose.
 
-    received: the number of poses so far. planar: whether all of them lie in one plane. noise: the noise of the localised
-    poses by the last calibration, and how long their errors last. The other factors of `noise` are 1.
+    received: the number of poses so far. planar: whether all poses lie in one plane. noise: the noise of the localised poses
+    and the time for which their errors last, by the last calibration. The other factors of `noise` are 1.
     """
 
     received: int = 0
@@ -60,8 +60,8 @@ class LocalizationState:
 class PairEvidence:
     """What frames say about pairs of landmarks of one label. A key holds the two ids, the smaller one first.
 
-    together: the number of frames that showed both landmarks. apart: holds the pairs that were tested and not merged. Its
-    value is the frame count of the landmark with fewer frames, divided by 5 and rounded down, at the last test. A pair is
+    together: the number of frames that showed both landmarks. apart: the pairs that were tested and not merged. The value of
+    a pair is the frame count of the landmark with fewer frames, divided by 5 and rounded down, at the last test. A pair is
     tested again when this value has changed.
     """
 
@@ -79,8 +79,8 @@ class MaintenanceSchedule:
     """When the maintenance tasks last ran.
 
     solved, culled: the number of keyframes at the last full solve, and at the last culling. relinearisations: how many early
-    relinearisations remain. compared: the input of the last search for loops, None before the first: the ids of the recently
-    seen landmarks, and the number of long unseen ones.
+    relinearisations remain. compared: the input of the last search for loops, None before the first search. It holds the ids
+    of the recently seen landmarks, and the number of long unseen landmarks.
     """
 
     solved: int = 0
@@ -98,17 +98,18 @@ class MapState:
     """The whole state of a session's map.
 
     graph: the factors and the estimate. cameras, labels: indexed by their numbers. rays: `owner` gives each ray's landmark.
-    tracks: in the order of their first observation. kinds: which labels are names so far.
-    landmark_of_track: id of the last landmark of each detector track. novelty: share of boxes that match no landmark, as an
-    exponential average over about 50 frames. pose_covariance: (6, 6) of the newest keyframe's predicted pose, in its camera
-    frame, rad and m, rotation first. NaN if the odometry does not determine it. frames: number of frames of each camera on
-    the course. rng: seeded by the settings. robot_parts: by the numbers of the cameras. second_labels: of
-    all cameras.
+    tracks: in the order of their first observation. kinds: which labels are names so far. landmark_of_track: id of the last
+    landmark of each detector track. novelty: share of boxes that match no landmark, as an exponential average over about 50
+    frames. pose_covariance: (6, 6) covariance of the newest keyframe's predicted pose, in its camera frame, rad and m,
+    rotation first. It is NaN if the odometry does not determine the pose. frames: number of frames of each camera on the
+    course. rng: seeded by the settings. robot_parts: the finder of robot parts of each camera, by the camera's number.
+    second_labels: the finder of second labels for all cameras.
 
-    errors: the shared errors that are corrected in all measurements, by name. calibration: their last estimate, None without
-    one. given: the settings as given. settings: the same, with odometry noise that fits the corrected distances.
-    sent_cameras: the cameras as received. cameras: the same, with the errors corrected. changed_cameras: the names of
-    cameras that got another lens or image size after their first boxes.
+    errors: the shared errors that are corrected in all measurements, by name. calibration: the last estimate of the shared
+    errors, at first from the calibration file, or None without either. given: the settings as given. settings: the same
+    settings, with odometry noise that fits the corrected distances. sent_cameras: the cameras as received. cameras: the same
+    cameras, with the errors corrected. changed_cameras: the names of cameras that got another lens or image size after their
+    first boxes.
     """
 
     settings: Settings
@@ -141,11 +142,11 @@ class MapState:
 
     @property
     def by_label(self) -> bool:
-        """Whether every label is one object so far."""
+        """Whether every label is the name of one object so far."""
         return self.kinds.all_names
 
     def newest_before(self, stamp: float) -> int | None:
-        """Return the row of the newest keyframe at or before a stamp, s, None if there is none."""
+        """Return the row of the newest keyframe at or before a stamp, s, or None without such a keyframe."""
         stamps = self.keyframes.stamp
         if len(stamps) and stamps[-1] <= stamp:
             return len(stamps) - 1
@@ -213,9 +214,10 @@ class MapState:
         return direction / np.linalg.norm(direction, axis=1, keepdims=True), np.hypot(rays.sigma[at], rays.centre_sigma[at])
 
     def to_centres(self, at: Ints) -> tuple[Floats, Floats]:
-        """Return what to add (n, 3) to the directions of the rays in rows (n,), so that they point to the centres of bodies.
+        """Return vectors (n, 3) to add to the directions of the rays in rows (n,), so that the rays point to the centres of
+        bodies.
 
-        The second array (n,) is its noise, rad. The poses are from the last refresh of the graph.
+        The second array (n,) is the noise of the vectors, rad. The poses are from the last refresh of the graph.
         """
         ids, index = np.unique(self.rays.keyframe[at], return_inverse=True)
         rows, poses = self.rows_of(self.rays.owner[at]), self.graph.poses(ids)[index]
@@ -223,7 +225,7 @@ class MapState:
         return to_centres(self.landmarks.position[rows] - poses[:, :3, 3], beside, sigma, poses[:, :3, :3])
 
     def sight(self, at: Ints) -> Observations:
-        """Return the rays in rows (n,) in map, from the camera poses at the graph's last refresh."""
+        """Return the rays in rows (n,) in the frame map, by the camera poses at the graph's last refresh."""
         rays = self.rays
         ids, index = np.unique(rays.keyframe[at], return_inverse=True)
         poses = self.graph.poses(ids)[index]
@@ -271,18 +273,19 @@ class MapState:
                 track.move(new_T_old)
 
     def note_class(self, label: int, judged: bool = False) -> None:
-        """Allow several objects for a label, and drop its track, which was grouped by label alone. judged: as in
+        """Allow several objects for a label. Drop the label's track, whose rays were grouped by label alone. judged: as in
         `LabelKinds.add_class`."""
         self.kinds.add_class(label, judged)
         self._drop_old_tracks()
 
     def note_name(self, label: int) -> None:
-        """Allow one object for a label, as a solve did. The caller leaves it at most one landmark."""
+        """Allow only one object for a label, as a solve did. The caller must leave the label at most one landmark."""
         self.kinds.add_name(label, self.next_id.ray)
         self._drop_old_tracks()
 
     def note_moving(self, label: int) -> None:
-        """Leave the boxes of a label out of the map, because they show things that move. The caller drops its landmarks."""
+        """Leave the boxes of a label out of the map, because they show things that move. The caller must drop its
+        landmarks."""
         self.kinds.add_moving(label)
         self._drop_old_tracks()
 

@@ -10,17 +10,18 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.trajectory import Trajectory, travel
 
 _MOST_POSES = 65_536
-"""The number of poses of a path above which some are dropped: 5 minutes at 200 Hz, 2 hours at 10 Hz. A larger number keeps
-long paths finer, for 160 bytes per pose."""
+"""The number of poses of a path above which some poses are dropped. It is reached after 5 minutes at 200 Hz, or 2 hours at
+10 Hz. With a larger number, the kept poses of a long path are closer together. Each pose takes 160 bytes."""
 _FULL = 0.75
-"""The share of `_MOST_POSES` that may stay when some are dropped. With a larger share, more poses stay, and some are dropped
-more often."""
+"""The share of `_MOST_POSES` that may stay when poses are dropped. With a larger share, more poses stay, and poses are
+dropped more often."""
 _LEAST = 0.25
-"""The share of `_MOST_POSES` that is reserved for poses that no solve asks for. A larger share keeps the path between old
-keyframes finer, and costs memory if there are many keyframes."""
+"""The share of `_MOST_POSES` that is reserved for poses that no solve asks for. With a larger share, poses between old
+keyframes are closer together. This costs memory in a map with many keyframes."""
 _SUMMED = 1024
-"""The way between poses is summed up for this number of poses at once, 1 ms for 1024. If it waited until poses are dropped,
-it would hold up one message by 50 ms. A larger number sums up more rarely, and holds up that message for longer."""
+"""The number of poses for which the travelled way is summed up at once. 1024 poses take 1 ms. All poses together, just
+before poses are dropped, would hold up one message by 50 ms. With a larger number, sums are rarer, and each sum holds up a
+message for longer."""
 _FIRST = 64  # The rows that a new table has room for. More rows cost memory, fewer rows cost copies in a young session.
 
 
@@ -80,10 +81,10 @@ class GrowingTable:
 class PathTable(GrowingTable):
     """The poses of a path in the order of their stamps, as the robot sent them.
 
-    If there are more than _MOST_POSES, poses at even intervals are kept and the others dropped, so that a session of months
-    takes no more memory. This makes no new gap near the stamps that a later solve asks for. Elsewhere, any time may lie
-    between two kept poses. The distance and the turn that the robot travelled between kept poses are kept, because the drift
-    of the odometry grows with them.
+    Above _MOST_POSES, poses at even intervals are kept and the others are dropped. So the memory of a session of months is
+    bounded. This makes no new gap near the stamps that a later solve asks for. Elsewhere, any time may lie between two kept
+    poses. The distance and the turn that the robot travelled between kept poses are kept, because the drift of the odometry
+    grows with them.
 
     max_gap: s, the shortest time between two poses that is a gap. reach: s, the longest time between a stamp that a solve
     asks for and the poses that it takes. newest: s, the time before the end of the path in which a solve may still ask for
@@ -98,7 +99,7 @@ class PathTable(GrowingTable):
         super().__init__()
         self._reach, self._newest = reach + max_gap, newest + max_gap
         self._widest, self._spacing, self._most = max_gap / 4, 0.0, _MOST_POSES
-        self._summed, self._thinned = 0, False  # How many poses have their `travel`. Whether poses were dropped.
+        self._summed, self._thinned = 0, False  # How many poses have `travel`. Whether poses were dropped.
 
     def append(self, stamp: float, pose: Floats, asked: Floats) -> None:
         """Append a pose (4, 4) at a stamp, s, later than all others. asked: (K,) s, the stamps that later solves ask for."""
@@ -109,7 +110,7 @@ class PathTable(GrowingTable):
         self.add(stamp=(stamp,), pose=pose[None], travel=0.0)
 
     def trajectory(self) -> Trajectory | None:
-        """Return a copy of the path, None if it has no pose."""
+        """Return a copy of the path, or None if it has no pose."""
         if not len(self):
             return None
         if self._thinned:
@@ -154,7 +155,7 @@ class PathTable(GrowingTable):
         return np.asarray(is_asked | (self.stamp >= self.stamp[-1] - self._newest))
 
     def _sum_up(self) -> None:
-        """Fill in `travel` of the poses that were appended since the last time."""
+        """Fill in `travel` of the poses that were appended since the last call."""
         begin = max(self._summed, 1)
         self.travel[begin:] = travel(self.pose[begin - 1 :])
         self._summed = len(self)
@@ -163,8 +164,9 @@ class PathTable(GrowingTable):
 class KeyframeTable(GrowingTable):
     """The keyframes in the order of arrival, with columns as in `types.Keyframes` and `course.Placed`.
 
-    camera_T_start: the start of the course in the camera frame. localized: whether map_T_base is from the localisation.
-    stamp, base_T_camera: corrected for the shared errors. sent, mount: the same two as received.
+    camera_T_start: the pose of the course's start in the camera frame. localized: whether map_T_base is from the
+    localisation. stamp, base_T_camera: corrected for the shared errors. sent, mount: the stamp and base_T_camera as
+    received.
     """
 
     id: Ints = column(np.int64)
@@ -187,8 +189,8 @@ class RayTable(GrowingTable):
     """The rays of the keyframes, one for each box, with columns as in `types.Rays`.
 
     number: the id of the ray, increasing. owner: the id of its landmark, or -1. used: whether the graph has its factor.
-    direction: through the centre of the box. to_centre: added to it in the graph, so that it points to the centre of a body,
-    with the standard deviation `centre_sigma`, rad.
+    direction: through the centre of the box. to_centre: the vector that the graph adds to `direction`, so that the sum
+    points to the centre of a body. centre_sigma: rad, the standard deviation of `to_centre`.
     """
 
     number: Ints = column(np.int64)

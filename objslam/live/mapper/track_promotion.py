@@ -16,11 +16,11 @@ from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
 AGREE = 0.7  # The share of a track's rays that must be inliers. A larger share makes landmarks later, and fewer false ones.
-SLACK = 0.02  # The assumed error (m) between camera poses of one track. With a larger one, more rays are inliers.
-_AGREE_BY_LABEL = 0.5  # `AGREE`, but for tracks that were grouped by label alone. A larger share makes landmarks later.
-_AGAIN = 1.2  # A track is tried again when its rays or its spread have grown by this factor. A smaller factor costs time.
+SLACK = 0.02  # The assumed error (m) between camera poses of one track. With a larger error, more rays are inliers.
+_AGREE_BY_LABEL = 0.5  # Like `AGREE`, for tracks grouped by label alone. A larger share makes landmarks later.
+_AGAIN = 1.2  # The growth of a track's rays or spread before it is tried again. A smaller factor costs time.
 _EARLY = 0.4  # This share of joint.min_parallax_deg suffices if the position is certain. A larger share delays landmarks.
-_SURE = 0.05  # A position with a sigma below this share of its distance is certain. A larger share accepts more false ones.
+_SURE = 0.05  # The sigma, as a share of the distance, below which a position is certain. A larger share accepts more errors.
 _MOST_TRACKS = 150  # The most tracks. Each track is predicted and matched in every frame, so more tracks take longer.
 
 
@@ -44,8 +44,9 @@ def promote_tracks(m: MapState, tracks: Sequence[Track]) -> list[Track]:
 def add_landmark(m: MapState, at: Ints, fit: PointFit, obs: Observations, seen: tuple[float, float], drift: Floats) -> None:
     """Make a landmark of rays. The graph adds it at its next update.
 
-    at: (n,) the rows of its rays, which the graph does not have. fit: its position. obs: the rays in map. seen: the stamps
-    (s) of its first and last observation. drift: (6, 6) odometry drift at the last observation.
+    at: (n,) the rows of the rays, which must not be in the graph yet. fit: the position of the landmark. obs: the rays in
+    the frame map. seen: the stamps (s) of the first and last observation. drift: (6, 6) odometry drift at the last
+    observation.
     """
     j = m.next_id.landmark
     m.next_id.landmark += 1
@@ -62,13 +63,13 @@ def add_landmark(m: MapState, at: Ints, fit: PointFit, obs: Observations, seen: 
         **{name: np.asarray(one)[None] for name, one in columns.items()},
     )
     measure_sizes(m, np.array([len(m.landmarks) - 1]))
-    m.rays.to_centre[at] = m.rays.centre_sigma[at] = 0.0  # They may have belonged to a landmark with a body.
+    m.rays.to_centre[at] = m.rays.centre_sigma[at] = 0.0  # The rays may have belonged to a landmark with a body.
     m.graph.add_landmark(j, fit.position)
     m.graph.add_rays(m.bearings(at[fit.inlier]))
 
 
 def try_promote(track: Track, graph: IncrementalGraph, settings: Settings, rng: np.random.Generator) -> PointFit | None:
-    """Return the position of a track's object if `fit_if_observable` finds one. If not, the track must grow (_AGAIN)."""
+    """Return the position of a track's object if `fit_if_observable` finds one. Else the track must first grow (_AGAIN)."""
     live, rays = settings.live, len(track.rays)
     unchanged = rays < _AGAIN * track.tried and track.spread < _AGAIN * track.tried_spread
     if rays < live.min_rays or unchanged:
@@ -90,11 +91,11 @@ def fit_if_observable(
     early: bool = False,
     slack: float = SLACK,
 ) -> PointFit | None:
-    """Triangulate rays in map, or return None.
+    """Return the point where rays meet, or None.
 
-    There are three reasons for None. The inliers are fewer than `least`, or a smaller share than `share`. The position is
-    uncertain. The parallax is low and there are no ranges. early: whether less parallax suffices if the position is certain.
-    slack: m, as in `fit_point`.
+    None has one of three reasons. The number of inliers is below `least`, or their share is below `share`. The position is
+    uncertain. The parallax is low and the rays have no ranges. obs: the rays in the frame map. early: whether less parallax
+    suffices if the position is certain. slack: m, as in `fit_point`.
     """
     fit = fit_point(obs, rng, slack)
     if fit is None or fit.inlier.sum() < least or fit.inlier.mean() < share:
@@ -111,8 +112,8 @@ def fit_if_observable(
 def prune_tracks(m: MapState) -> None:
     """Remove and count the tracks above the limit.
 
-    The labels with the most tracks lose tracks first. Of one label, tracks with fewer than live.min_rays rays go first, then
-    the tracks that were unseen for longest.
+    The labels with the most tracks lose tracks first. Within a label, tracks with fewer than live.min_rays rays are removed
+    first, and then the tracks that were unseen for longest.
     """
     if len(m.tracks) <= _MOST_TRACKS:
         return

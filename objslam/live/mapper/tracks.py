@@ -12,14 +12,15 @@ from objslam.core.arrays import Floats, Ints
 from objslam.graph.isam2 import IncrementalGraph
 
 _DEPTH = 2.5  # The first guess of a track's distance (m) without a range: about the middle of a room.
-_DEPTH_SIGMA = 2.0  # The prior's sigma (m) of a track along its last ray. With a larger one, rays move the track more.
+_DEPTH_SIGMA = 2.0  # The prior's sigma (m) of a track along its last ray. With a larger sigma, rays move it more.
 _DAMPING = 1e-3  # The prior's information (m^-2) in all directions. With a larger value, rays move the track less.
 _STEPS = 3  # The Gauss-Newton steps from a track's previous position, which is near. More steps take longer in every frame.
 _RECENT = 30  # The newest rays that define a track's position. More rays average noise better, but span more drift.
-_LONGEST = 200  # The most rays of a track. Above it, every second ray of the older half goes. More cost memory and time.
+_LONGEST = 200  # The most rays of a track. Above it, every second ray of the older half is dropped. More rays cost memory.
 
 TrackRay = tuple[int, int, Floats, float, float, float]
-"""The number of a ray, its keyframe, its direction (3,) in the camera, sigma in rad, range in m and range_sigma in m."""
+"""One ray of a track: its number, its keyframe, its direction (3,) in the camera frame, sigma in rad, range and range_sigma
+in m."""
 
 
 @dataclass(eq=False)
@@ -27,9 +28,9 @@ class Track:
     """The rays of one object that is not a landmark yet.
 
     label: the number of its label. by_label: whether its rays were grouped by label alone. first, last: stamps, s, of its
-    first and last observation. drift: (6, 6) odometry drift at the last observation. position, covariance: (3,) m and (3, 3)
-    m^2 in map, from the camera poses at its last observation. spread: rad, the widest angle between a ray and the first ray.
-    tried, tried_spread: the number of rays and the spread at the last attempt to make a landmark.
+    first and last observation. drift: (6, 6) odometry drift at the last observation. position: (3,) m and covariance: (3, 3)
+    m^2 are in the frame map, by the camera poses at the last observation. spread: rad, the widest angle between a ray and
+    the first ray. tried, tried_spread: the number of rays and the spread at the last attempt to make a landmark.
     """
 
     id: int
@@ -47,7 +48,7 @@ class Track:
     _ahead: Floats | None = None
 
     def numbers(self) -> Ints:
-        """Return the numbers of its rays."""
+        """Return the numbers of the track's rays."""
         return np.array([ray[0] for ray in self.rays], dtype=np.int64)
 
     def extend(self, ray: TrackRay, map_T_camera: Floats, stamp: float, drift: Floats) -> None:
@@ -65,7 +66,7 @@ class Track:
         self.spread = max(self.spread, math.acos(min(1.0, float(n @ self._ahead))))
 
     def sight(self, graph: IncrementalGraph) -> Observations:
-        """Return the rays of the track in map, at the current poses of the graph."""
+        """Return the rays of the track in the frame map, by the current camera poses of the graph."""
         return _in_map(self.rays, graph)
 
     def remeasure(self, directions: Floats, ranges: Floats, range_sigmas: Floats, drift: Floats) -> None:
@@ -79,7 +80,7 @@ class Track:
         self.drift = drift
 
     def move(self, new_T_old: Floats) -> None:
-        """Move its position and covariance in map by a pose (4, 4)."""
+        """Move the track's position and covariance in the frame map by a pose (4, 4)."""
         turn = new_T_old[:3, :3]
         self.position = turn @ self.position + new_T_old[:3, 3]
         self.covariance = turn @ self.covariance @ turn.T
@@ -90,7 +91,7 @@ def update_positions(tracks: Sequence[Track], graph: IncrementalGraph) -> None:
     """Triangulate the newest rays of all tracks in one batch, with their previous positions as weak priors.
 
     The rays begin at the current camera poses of the graph. The predicted pose of a frame may be wrong by more than the
-    noise of a ray, and later measurements correct it. Rays from the predicted poses would not meet.
+    noise of a ray, until later measurements correct this pose. So rays from predicted poses would not meet.
     """
     if not tracks:
         return
@@ -105,7 +106,7 @@ def update_positions(tracks: Sequence[Track], graph: IncrementalGraph) -> None:
 
 
 def _in_map(rays: Sequence[TrackRay], graph: IncrementalGraph) -> Observations:
-    """Return rays in map at the current camera poses of the graph."""
+    """Return rays in the frame map, by the current camera poses of the graph."""
     _, keyframe, direction, sigma, range_, range_sigma = zip(*rays, strict=True)
     ids, index = np.unique(keyframe, return_inverse=True)
     poses = np.array([graph.pose(k) for k in ids.tolist()])[index]

@@ -15,7 +15,7 @@ _PLANAR = 1e-6  # The tolerance (m, rad) of a planar path. A larger value accept
 
 
 class OnPath(NamedTuple):
-    """A pose (4, 4) on a path, the drift (6, 6) accumulated up to the pose, and the number of its stretch."""
+    """A pose (4, 4) on a path, the drift (6, 6) accumulated up to this pose, and the number of the path's stretch."""
 
     pose: Floats
     drift: Floats
@@ -25,9 +25,9 @@ class OnPath(NamedTuple):
 class PathBuffer:
     """The robot's poses in the last `seconds` of a path. Drift accumulates in the coordinate frame of the first pose.
 
-    max_gap: s. A longer gap ends a stretch of the path, and no pose is interpolated in it. planar: whether all poses so far
-    have one height, roll and pitch. newest: the stamp of the newest pose. stretch_begin: the first stamp of the newest
-    stretch, inf without poses.
+    max_gap: s. A longer gap ends a stretch of the path, and no pose is interpolated in such a gap. planar: whether all poses
+    so far have one height, roll and pitch. newest: the stamp of the newest pose, s. stretch_begin: the first stamp of the
+    newest stretch, s, inf without poses.
     """
 
     def __init__(self, settings: Odometry, seconds: float, max_gap: float) -> None:
@@ -72,11 +72,11 @@ class PathBuffer:
 
     @property
     def oldest(self) -> float:
-        """The stamp of the oldest pose, inf without poses."""
+        """The stamp of the oldest pose, s. It is inf without poses."""
         return self._stamps[0] if self._stamps else np.inf
 
     def stretch(self, stamp: float) -> int | None:
-        """Return the number of the stretch at a stamp. None outside the path or in a gap longer than max_gap."""
+        """Return the number of the stretch at a stamp, s. Return None outside the path or in a gap longer than max_gap."""
         if not self.oldest <= stamp <= self.newest:
             return None
         after = bisect_left(self._stamps, stamp)
@@ -84,7 +84,8 @@ class PathBuffer:
         return on if self._stamps[after] == stamp or self._path[after - 1].stretch == on else None
 
     def at(self, stamp: float) -> OnPath | None:
-        """Return the interpolated pose and drift at a stamp. None outside the path or in a gap longer than max_gap."""
+        """Return the interpolated pose and drift at a stamp, s. Return None outside the path or in a gap longer than
+        max_gap."""
         stretch = self.stretch(stamp)
         if stretch is None:
             return None

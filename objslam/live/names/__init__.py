@@ -1,2 +1,2 @@
-"""Judges which labels of a session are names of one object, classes of several, or of things that move. A process beside the
-session solves the names of the whole drive."""
+"""Judges for each label of a session whether it is the name of one object, a class of several objects, or the label of
+things that move. A separate process solves the whole drive for this."""

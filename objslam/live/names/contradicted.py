@@ -1,4 +1,4 @@
-"""Names that boxes contradict: many boxes of the label do not fit its landmark."""
+"""Finds names that boxes contradict. Many boxes of such a label do not fit its landmark."""
 
 import numpy as np
 
@@ -10,8 +10,8 @@ from objslam.mapping.joint.labels import MANY, SECOND
 def contradicted(m: MapState) -> Bools:
     """Return which landmarks (N,) have a name and many rays that do not fit, as in `mapping.joint.labels.rejected`.
 
-    Until the label is judged, such a position is not certain: the landmark may be of a thing that moves, or of several. Of a
-    name that a solve has confirmed, only later rays count.
+    Until the label is judged, the position of such a landmark is uncertain. The label may belong to a thing that moves, or
+    to several things. After a solve has confirmed a name, only later rays count.
     """
     landmarks, rays = m.landmarks, m.rays
     if not len(landmarks) or m.settings.association.method != "auto":

@@ -1,8 +1,8 @@
 """Judges in rounds which labels of a running session are names.
 
-A person who walks has a label, and so has each of two cups that no frame shows together. Their rays bend the path of a
-session, and then the rays of true names disagree as well. Only a solve of the whole drive, without the labels that scatter,
-shows which is which. The other labels keep their names.
+The label of a person who walks is taken for a name at first. So is the label of two cups that no frame shows together. The
+rays of such labels bend the path of a session, and then the rays of true names disagree as well. Only a solve of the whole
+drive without the labels whose rays scatter shows which labels are names. The labels whose rays agree stay names.
 """
 
 from __future__ import annotations
@@ -28,16 +28,17 @@ from objslam.mapping.joint.labels import MANY
 from objslam.sources.journal.corrections import NamesMessage
 
 _GROWTH = 1.3
-"""A round begins when the number of keyframes has grown by this factor since the last one began, if a name is contradicted
-by then. A larger factor judges more rarely, and takes less time."""
+"""The factor by which the number of keyframes grows between the starts of two rounds. A round only begins if a name is
+contradicted. With a larger factor, labels are judged more rarely, which takes less time."""
 _DELAY = 0.1
-"""The judgement takes effect when the number of keyframes has grown by this share since the round began. A larger share
-suits slower machines, but a thing that moves stays in the map for longer."""
+"""The share by which the number of keyframes grows between the start of a round and the effect of its judgement. A larger
+share suits slower machines, but a thing that moves stays in the map for longer."""
 _AGREE = 0.5
-"""The share of the rays of a name that meet, if it gets a landmark again. A larger share gives fewer landmarks."""
+"""The least share of a name's rays that must meet in one point before the name gets a landmark again. A larger share gives
+fewer landmarks."""
 _SLACK = 0.2
-"""The standard deviation (m) of camera poses that bent with a wrong name, before it gets its landmark again. A larger one
-keeps more rays for its first position."""
+"""The assumed standard deviation (m) of the camera poses when a name gets a landmark again, because wrong names have bent
+the path. With a larger value, more rays count for the first position of the landmark."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,8 @@ class NamesRequest:
     settings: Settings
 
     def solve(self) -> NamesMessage | None:
-        """Judge the labels by the offline solve of names. The caller puts in the keyframe, which is 0 here. None if labels
-        do not show the path. Raises SolveError if the solve fails."""
+        """Judge the labels by the offline solve of names. The keyframe of the message is 0, and the caller must set it.
+        Return None if the labels do not determine the path. Raises SolveError if the solve fails."""
         from objslam.mapping.joint.joint_alternation import JointState
         from objslam.mapping.joint_solve import solve_names
         from objslam.mapping.solution import seen_something
@@ -89,7 +90,8 @@ class NameJudge(Rounds[NamesMessage | None, NamesMessage]):
         self._counters, self._name = counters, name
 
     def _request(self) -> NamesRequest | None:
-        """Return the drive so far. None if all names agree with their landmarks, or if there are too many boxes."""
+        """Return the drive so far. Return None if all names agree with their landmarks, or if the session has too many
+        boxes."""
         m = self._mapper.state
         if m.settings.association.method != "auto" or not m.kinds.are_names:
             return None
@@ -123,7 +125,7 @@ class NameJudge(Rounds[NamesMessage | None, NamesMessage]):
         for label in moving:
             m.note_moving(label)
         for label in correction.several.tolist():
-            # Of a label that moved before, only the end has objects: the tracks of a session would follow the rest.
+            # A label that moved stays out of the running map. Its tracks would follow the rays that still move.
             if label not in kinds.several | kinds.moving:
                 m.note_class(label, judged=True)
         for label in names:
@@ -135,13 +137,13 @@ class NameJudge(Rounds[NamesMessage | None, NamesMessage]):
             self._counters.accept("labels of things that move", len(moving))
         if added or gone.any():
             m.graph.update()
-            m.schedule.solved = 0  # The next full solve tests which rays agree without the wrong ones.
+            m.schedule.solved = 0  # So a full solve comes soon. It tests which rays now agree.
             m.schedule.relinearise_soon()
             m.solve_corrected()
 
 
 def _firsts(m: MapState) -> Bools:
-    """Return which landmarks (N,) are the ones of their label with the most observations."""
+    """Return which landmarks (N,) have the most observations of all landmarks of their label."""
     landmarks = m.landmarks
     order = np.lexsort((landmarks.id, -landmarks.seen, landmarks.label))
     first = np.zeros(len(landmarks), dtype=bool)
@@ -150,7 +152,8 @@ def _firsts(m: MapState) -> Bools:
 
 
 def _add(m: MapState, label: int) -> bool:
-    """Give the landmark of a name all rays of its label. If it has none, make one. Return whether anything changed."""
+    """Give the landmark of a name all free rays of its label. If the name has no landmark, make one. Return whether one was
+    made."""
     mine = _best(m, label)
     free = mine[m.rays.owner[mine] < 0]
     rows = np.flatnonzero(m.landmarks.label == label)
@@ -172,7 +175,7 @@ def _add(m: MapState, label: int) -> bool:
 
 
 def _best(m: MapState, label: int) -> Ints:
-    """Return the rows of the rays of a label, the one with the highest score of each keyframe."""
+    """Return the row of the ray with the highest score among the rays of a label, for each keyframe that has such rays."""
     at = np.flatnonzero(m.rays.label == label)
     order = at[np.lexsort((at, -m.rays.score[at], m.rays.keyframe[at]))]
     return np.sort(order[np.unique(m.rays.keyframe[order], return_index=True)[1]])

@@ -15,8 +15,8 @@ from objslam.live.mapper.state import MapState
 from objslam.sources.journal.corrections import AssociationMessage
 
 _GONE = 0.1
-"""A landmark is no object if the association gives at most this share of its rays to objects. Things that move and false
-boxes end so. A larger share drops more landmarks."""
+"""The largest share of a landmark's rays that the association may give to objects if the landmark is to leave the map. Such
+landmarks come from things that move and from false boxes. A larger share drops more landmarks."""
 _LATER = -2  # The index of a ray that the association does not know. The index of a ray without an object is -1.
 
 
@@ -24,10 +24,10 @@ _LATER = -2  # The index of a ray that the association does not know. The index 
 class Plan:
     """What an association changes.
 
-    owner: (R,) the landmark of each ray in the session's table, -1 without one. used: (R,) which rays are in the graph.
-    objects: (N,) the objects of the association that have a ray in the table. ids: (N,) their landmarks. new: (N,) whether
-    these are not in the map yet. heirs: the landmark that the association makes of a landmark, -1 for none, by ids. gone:
-    (n,) the ids of the landmarks that leave the map.
+    owner: (R,) the id of the landmark of each ray in the session's table, -1 for a ray without a landmark. used: (R,) which
+    rays are in the graph. objects: (N,) the objects of the association that have a ray in the table. ids: (N,) the id of the
+    landmark of each object. new: (N,) whether this landmark is not in the map yet. heirs: for the id of a landmark, the id
+    of the landmark that gets most of its rays, or -1 for none. gone: (n,) the ids of the landmarks that leave the map.
     """
 
     owner: Ints
@@ -40,10 +40,10 @@ class Plan:
 
 
 def plan_of(m: MapState, found: AssociationMessage) -> Plan:
-    """Return what an association changes. It changes nothing itself.
+    """Return what an association changes in the map. This function does not change the map.
 
-    Objects and landmarks are paired one to one so that the pairs share the most rays, and such an object keeps the id of its
-    landmark. Rays that came after the association follow the other rays of their landmark.
+    Objects and landmarks are paired one to one, so that the pairs share the most rays. An object with a partner keeps the id
+    of this landmark. Rays that came after the association follow the other rays of their landmark.
     """
     rays, landmarks = m.rays, m.landmarks
     groups = (found.free, *found.rays)
@@ -51,7 +51,7 @@ def plan_of(m: MapState, found: AssociationMessage) -> Plan:
     there = np.isin(numbers, rays.number)
     of = np.repeat(np.arange(-1, len(found.rays)), [len(group) for group in groups])
     index[np.searchsorted(rays.number, numbers[there])] = of[there]
-    index[~m.kinds.classes(rays.label)] = _LATER  # Meanwhile, a label may be judged a name, or of things that move.
+    index[~m.kinds.classes(rays.label)] = _LATER  # Meanwhile, a label may have become a name, or moving.
     objects, answered = np.unique(index[index >= 0]), index > _LATER
     index = np.where(index >= 0, np.searchsorted(objects, index), index)
     held, count = answered & (rays.owner >= 0), len(objects)
@@ -80,9 +80,10 @@ def plan_of(m: MapState, found: AssociationMessage) -> Plan:
 def adopt(m: MapState, found: AssociationMessage) -> tuple[int, int, int]:
     """Correct the map by an association of the drive so far.
 
-    Keyframes that it does not know move like the last known one before them, and landmarks that it does not know like the
-    last keyframe that saw them. The new map depends only on the old map and the arguments, so that a resumed session makes
-    it again. Returns how many landmarks became one with others, left the map, and entered it.
+    A keyframe that the association does not know moves like the last known keyframe before it. A landmark that the
+    association does not know moves like the last keyframe that saw it. The new map depends only on the old map and the
+    arguments, so a resumed session makes the same map. Return three numbers: the landmarks that became one with others, that
+    left the map, and that entered it.
     """
     m.graph.refresh()
     m.read_positions()
@@ -109,16 +110,16 @@ def adopt(m: MapState, found: AssociationMessage) -> tuple[int, int, int]:
 
 
 def _solve(m: MapState) -> None:
-    """Solve the corrected map at once, by one step. Its estimate is near, because the association comes with a solve of its
-    own. Relinearisations follow."""
+    """Solve the corrected map at once, by one step. One step is enough, because the association has already solved the
+    drive. Relinearisations follow."""
     m.graph.rebuild()
     m.read_positions()
     m.schedule.relinearise_soon()
 
 
 def _place_keyframes(m: MapState, found: AssociationMessage) -> Floats | None:
-    """Move keyframes, landmarks and tracks to the path of an association. Return the pose (4, 4) that took its path into the
-    map, None if the map has none of its keyframes.
+    """Move keyframes, landmarks and tracks to the path of an association. Return the pose (4, 4) of the association's frame
+    in the map, or None if the map has no keyframe of the association.
 
     Without a localisation, the path of the association is laid on the first keyframe, which the graph holds.
     """
@@ -135,7 +136,7 @@ def _place_keyframes(m: MapState, found: AssociationMessage) -> Floats | None:
     stamps = k.stamp[order]
 
     def at(last: Floats) -> Floats:
-        """The motions (n, 4, 4) of what was seen last at these stamps (n,), s."""
+        """Return the motions (n, 4, 4) of things that were last seen at the stamps (n,), s."""
         return np.asarray(moved[(np.searchsorted(stamps, last, side="right") - 1).clip(min=0)])
 
     landmarks = m.landmarks
@@ -150,8 +151,8 @@ def _place_keyframes(m: MapState, found: AssociationMessage) -> Floats | None:
 
 
 def _update_landmarks(m: MapState, plan: Plan, positions: Floats) -> None:
-    """Add the new landmarks, and describe all landmarks of the association by their rays. positions: (N, 3) of its
-    objects."""
+    """Add the new landmarks, and describe all landmarks of the association by their rays. positions: (N, 3), m, of the
+    association's objects."""
     landmarks, rays, k = m.landmarks, m.rays, m.keyframes
     expected = dict(zip(landmarks.id.tolist(), landmarks.expected.tolist(), strict=True))
     inherited: Counter[int] = Counter()
@@ -175,7 +176,7 @@ def _update_landmarks(m: MapState, plan: Plan, positions: Floats) -> None:
             m.graph.add_landmark(j, position)
             continue
         row = int(np.searchsorted(landmarks.id, j))
-        if landmarks.shape[row]:  # The position of the association is where rays meet, and not the centre of a body.
+        if landmarks.shape[row]:  # In the association, the position is where rays meet. Here it is the centre of a body.
             columns["position"] = position = landmarks.position[row]
         for name, value in columns.items():
             getattr(landmarks, name)[row] = value
@@ -184,7 +185,7 @@ def _update_landmarks(m: MapState, plan: Plan, positions: Floats) -> None:
 
 
 def _forget_old_ids(m: MapState, plan: Plan) -> None:
-    """Give what is known of landmarks that became one to the landmark that stays."""
+    """Move the evidence about merged landmarks to the landmark that stays."""
     together: Counter[tuple[int, int]] = Counter()
     for pair, number in m.pairs.together.items():
         one, other = sorted(plan.heirs.get(j, j) for j in pair)
@@ -197,7 +198,7 @@ def _forget_old_ids(m: MapState, plan: Plan) -> None:
 
 
 def _release(m: MapState) -> None:
-    """Take the rays of landmarks out of the tracks. A track that loses more than half of its rays goes."""
+    """Take the rays of landmarks out of the tracks. A track that loses more than half of its rays is dropped."""
     owned = set(m.rays.number[m.rays.owner >= 0].tolist())
     kept = []
     for track in m.tracks:

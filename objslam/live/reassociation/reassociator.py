@@ -1,9 +1,10 @@
 """Associates the whole drive of a running session again, in rounds.
 
-A session decides for each frame which box is of which object, and some decisions become wrong later. A thing that comes back
-into view after a long drive is a new object, until the path is known well enough. A robot that turns sees a thing for a
-second, and minutes later again from another place. No such view alone gives a position, and the tracks of two views do not
-meet before the path is right. The offline association settles all of this: it solves the whole drive.
+A session decides for each frame which box belongs to which object. Some decisions turn out to be wrong later. A thing that
+comes back into view after a long drive is a new object, until the path is known well enough. A robot that turns sees a thing
+for a second, and sees it again minutes later from another place. No single view gives a position, and the tracks of the two
+views do not meet before the path is right. The offline association corrects all these errors, because it solves the whole
+drive.
 """
 
 from __future__ import annotations
@@ -30,26 +31,26 @@ from objslam.live.rounds import Rounds
 from objslam.sources.journal.corrections import AssociationMessage
 
 _GROWTH = 1.3
-"""A round begins when the number of keyframes has grown by this factor since the last one began. A larger factor takes less
-time, but things that come back into view are new objects for longer."""
+"""The factor by which the number of keyframes grows between the starts of two rounds. A larger factor takes less time, but
+things that come back into view stay new objects for longer."""
 _DELAY = 0.1
-"""The association takes effect when the number of keyframes has grown by this share since the round began. A larger share
-suits slower machines, but corrects the map later."""
+"""The share by which the number of keyframes grows between the start of a round and the correction of the map. A larger
+share suits slower machines, but corrects the map later."""
 _KNOWN = 0.5
-"""An object is in the map already if at least this share of its rays belongs to landmarks of the session. Any other object
-enters the map only if its position is reliable. A larger share keeps more objects out."""
+"""The least share of an object's rays that belong to landmarks of the session if the object is already in the map. Any other
+object enters the map only if its position is reliable. A larger share keeps more objects out."""
 _RIGHT = 0.5
-"""An association takes effect only if it gives at least this share of the rays of all landmarks to objects. With a smaller
-share, a solve that went wrong may spoil the map. With a larger one, people who walk stay landmarks where there are many of
-them: with 0.7, four simulated sessions among eight people ended their drive with 23 false objects, and with 0.5 with 15."""
+"""The least share of the rays of all landmarks that an association must give to objects to take effect. With a smaller
+share, a wrong solve may spoil the map. With a larger share, walking people stay landmarks in places with many people. Four
+simulated sessions among eight people ended with 23 false objects at 0.7, and with 15 at 0.5."""
 
 
 @dataclass(frozen=True)
 class AssociationRequest:
     """The drive of a session so far.
 
-    owner: (R,) the session's landmark of each of its rays, -1 without one. classes: (R,) whether the label of a ray may have
-    several objects. The rays of other labels stay with their landmarks.
+    owner: (R,) the session's landmark of each ray, -1 for a ray without a landmark. classes: (R,) whether the label of a ray
+    may have several objects. The rays of other labels stay with their landmarks.
     """
 
     found: Collected
@@ -61,9 +62,9 @@ class AssociationRequest:
     def solve(self) -> AssociationMessage | None:
         """Associate and solve the drive as at the end of the session.
 
-        The caller puts in the keyframe, which is 0 here. An object that the session does not know is left out if its
-        parallax is little, because later views would not fit its first position. None if the solve explains too few rays,
-        or if poses are too far away. Raises SolveError if the solve fails.
+        The keyframe of the message is 0, and the caller must set it. An object that the session does not know is left out if
+        its parallax is small, because later views would not fit its first position. Return None if the solve explains too
+        few rays, or if poses are too far away. Raises SolveError if the solve fails.
         """
         from objslam.graph.init_unknown_correspondences import InitialEstimate
         from objslam.mapping.alternation import solve
@@ -124,8 +125,9 @@ class Reassociator(Rounds[AssociationMessage | None, AssociationMessage]):
         self._counters, self._name = counters, name
 
     def _request(self) -> AssociationRequest | None:
-        """Return the drive so far. None if no label has several objects, if there are no landmarks, if there are too many
-        boxes, or if the map is tied to a prior map. The association does not know the objects of a prior map."""
+        """Return the drive so far. Return None if no label has several objects, if the map has no landmarks, if the session
+        has too many boxes, or if the map is tied to a prior map. The association does not know the objects of a prior
+        map."""
         m = self._mapper.state
         if map_T_graph(m.graph) is not None:
             return None
@@ -139,7 +141,7 @@ class Reassociator(Rounds[AssociationMessage | None, AssociationMessage]):
         )
 
     def _correction(self, number: int, answer: AssociationMessage | None) -> AssociationMessage | None:
-        """Return the association if it changes which landmarks there are. Else return None."""
+        """Return the association if it adds, removes or merges landmarks. Else return None."""
         if answer is None or map_T_graph(self._mapper.state.graph) is not None:
             self._counters.accept("associations given up")
             return None

@@ -24,10 +24,10 @@ Drop = Callable[[str, str], None]  # A function that counts a drop. Its argument
 class Boxes:
     """The boxes of one image.
 
-    stamp: s. frame: the camera's tf frame, "" if unknown. arrived: the time of arrival, s, by any clock. boxes: (B, 4), raw
-    px. points: centre and corners (5, 3) of a tag, m, in the camera frame, by the index of the box that is computed from
-    them. size: (width, height) of the image, px, None if unknown. whole: True if no box is cut off at the image's edge.
-    image: (H, W, 3) uint8 BGR, None if not available.
+    stamp: s. frame: the camera's tf frame, or "" if unknown. arrived: the time of arrival, s, by the caller's clock. boxes:
+    (B, 4), raw px. points: the centre and corners (5, 3) of a tag, m, in the camera frame, by the index of the box that they
+    give. size: (width, height) of the image, px, or None if unknown. whole: True if no box is cut off at the image's edge.
+    image: (H, W, 3) uint8 BGR, or None if not available.
     """
 
     topic: str
@@ -70,7 +70,7 @@ class DepthImages:
         return kept is not None and kept[-1][0] < boxes.stamp - MAX_IMAGE_LAG
 
     def at(self, boxes: Boxes, camera: Camera) -> Floats | None:
-        """Return the depths (B,) of boxes, m, NaN where unknown. None if their camera has no depth images."""
+        """Return the depths (B,) of boxes, m, NaN where unknown. Return None if their camera has no depth images."""
         kept = self._kept.get(boxes.frame)
         if not kept:
             return None

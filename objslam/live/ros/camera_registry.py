@@ -22,10 +22,10 @@ from objslam.ros.tf.frames import unchanged
 from objslam.ros.topics import closeness, is_named, is_rectified, mount_of
 
 PATIENCE = 1.0  # The time that boxes wait for their camera's calibration and transform, s. A larger value drops fewer boxes.
-_DEPTH_WAIT = 0.2  # The time that boxes wait for their depth image, s. A larger value uses depths of slower cameras.
+_DEPTH_WAIT = 0.2  # The time that boxes wait for their depth image, s. A larger value serves slower cameras.
 _MAX_WAITING = 200  # The most images whose boxes wait. A larger number costs memory.
 _IMAGES = 4  # The number of images per camera that are kept for display. A larger number costs memory.
-_SAME = 0.001  # The most that the stamps of an image and its boxes differ, s. It is far below the time between two images.
+_SAME = 0.001  # The largest difference of the stamps of an image and its boxes, s. Two images are much further apart.
 _MAX_CAMERAS = 64  # The most cameras that are kept. A larger number costs memory.
 
 
@@ -33,9 +33,9 @@ _MAX_CAMERAS = 64  # The most cameras that are kept. A larger number costs memor
 class _Known:
     """A calibrated camera.
 
-    source: the tf frame in its CameraInfo, "" if a file gives the calibration. frame: the camera's tf frame. frame_T_camera:
-    (4, 4) the pose of its optical frame in `frame`. placed: whether a file gives base_T_camera. pushed: the last
-    base_T_camera that was pushed.
+    source: the tf frame in the camera's CameraInfo, or "" if a file gives the calibration. frame: the camera's tf frame.
+    frame_T_camera: (4, 4) the pose of the camera's optical frame in `frame`. placed: whether a file gives base_T_camera.
+    pushed: the last base_T_camera that was pushed.
     """
 
     camera: Camera
@@ -47,10 +47,12 @@ class _Known:
 
 
 class Cameras:
-    """Pushes each camera when its calibration and mount are known, then its boxes in order, and mounts that change.
+    """Pushes each camera when its calibration and mount are known. Then pushes its boxes in order, and its mount when that
+    changes.
 
-    base: returns the name of the base frame. calibrations: from a file, instead of CameraInfo. rectified: whether boxes are
-    in rectified images. None decides by the names of the topics. mounts: from a file, instead of tf.
+    base: returns the name of the base frame. calibrations: calibrations from a file, used instead of CameraInfo. rectified:
+    whether boxes are in rectified images. With None, the names of the topics decide. mounts: mounts from a file, used
+    instead of tf.
     """
 
     def __init__(
@@ -146,7 +148,7 @@ class Cameras:
         return ""
 
     def image(self, camera: str, stamp: float) -> NDArray[np.uint8] | None:
-        """Return the image of a camera, by its name, at a stamp, s. None if it is not among the newest images."""
+        """Return the image of the camera of a name at a stamp, s. Return None if it is not among the newest images."""
         return next((image for at, image in self._images.get(camera, ()) if abs(at - stamp) <= _SAME), None)
 
     def _make(self, boxes: Boxes, waited: float) -> _Known | str:
@@ -183,10 +185,11 @@ class Cameras:
         return known
 
     def _source(self, boxes: Boxes, waited: float) -> str | None:
-        """Return the frame of the CameraInfo for boxes, None if there is none yet. waited: s.
+        """Return the frame of the CameraInfo for boxes, or None before a CameraInfo has arrived. waited: the time that the
+        boxes have waited, s.
 
         Usually this is the frame of the boxes. After half of `PATIENCE` without a CameraInfo of that frame, the CameraInfo
-        of the closest topic is used.
+        of the topic with the most similar name is used.
         """
         if boxes.frame in self._infos:
             return boxes.frame

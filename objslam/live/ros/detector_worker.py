@@ -24,7 +24,7 @@ _FAILED, _ENDED = "image that the detector failed on", "image that arrived after
 
 
 class DetectorWorker:
-    """Runs a detector on offered images, and delivers its boxes.
+    """Runs a detector on offered images, and delivers the boxes.
 
     For each topic, only the newest image waits. The topics take turns.
     """
@@ -48,7 +48,7 @@ class DetectorWorker:
         """Take an image message without blocking. stamp: s."""
         with self._ready:
             ended = self._ended
-            # The newer image takes the place of the older one. At the end of the queue it might never be next.
+            # The newer image takes the older image's place in the queue. At the end of the queue it might never be next.
             late = self._waiting.get(topic)
             full = late is None and len(self._waiting) >= _MAX_TOPICS
             if not full and not ended:
@@ -62,7 +62,7 @@ class DetectorWorker:
             self._drop(f"image of a topic beyond the first {_MAX_TOPICS}", topic)
 
     def close(self) -> None:
-        """End the thread after its present image."""
+        """End the thread after the image that it now processes."""
         with self._ready:
             self._closed = True
             self._ready.notify()

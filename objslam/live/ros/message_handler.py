@@ -29,17 +29,17 @@ from objslam.sources.ros_bag.options import RosOptions
 if TYPE_CHECKING:
     from objslam.live.ros.detector_worker import DetectorWorker
 
-_GRACE = 2.0  # The wait for an odometry topic before tf is used, s. A larger value delays the start of a robot without one.
-_LONGEST = 160  # The most characters of a place in the ledger. A larger number makes longer lines.
-_MAX_TRACKS = 100_000  # The track names above which all are forgotten. A larger number costs memory.
+_GRACE = 2.0  # The wait for an odometry topic before tf is used, s. A larger value delays robots without one.
+_LONGEST = 160  # The most characters of a message's name in the ledger. A larger number makes longer lines.
+_MAX_TRACKS = 100_000  # The number of track names above which all names are forgotten. A larger number costs memory.
 
 
 class RosMessages:
-    """Takes messages of ROS 1 or 2 by type, and pushes their content into a sink. Any thread may call it.
+    """Takes messages of ROS 1 or 2 by type, and pushes their content into a sink. Any thread may call the methods.
 
-    Odometry comes from one topic, or from tf if there is no topic. Localisation comes from an Odometry topic in the frame
-    map, from the topics of poses that the options name, or from tf. In tf, each new transform map -> odom is pushed with the
-    next odometry. Without odom in tf, the pose of base in map is pushed. ledger: the counts of unusable messages. chosen:
+    Odometry comes from one topic, or from tf without such a topic. Localisation comes from an Odometry topic in the frame
+    map, from the topics of poses that the options name, or from tf. From tf, each new transform map -> odom is pushed with
+    the next odometry. If tf has no odom, the pose of base in map is pushed. ledger: the counts of unusable messages. chosen:
     the topics that the options name. sources: the topic in use, or "tf", by role.
     """
 
@@ -71,7 +71,8 @@ class RosMessages:
             detector.start(self.add_boxes, self.refuse, self._warn)
 
     def receive(self, type_: str, topic: str, message: Any, received: float) -> None:
-        """Take a message. type_: in ROS 2 form, as nav_msgs/msg/Odometry. received: s since 1970, used for unset stamps."""
+        """Take a message. type_: the type in ROS 2 form, as nav_msgs/msg/Odometry. received: s since 1970, the stamp if it
+        is unset."""
         with self._lock:
             if type_ == ODOMETRY:
                 self._take_odometry(topic, message, received)
@@ -106,13 +107,13 @@ class RosMessages:
             self._cameras.add(boxes)
 
     def image(self, camera: str, stamp: float) -> NDArray[np.uint8] | None:
-        """Return a camera's image (H, W, 3), uint8 BGR, at a stamp, s. None if it is not among the detector's newest
-        images."""
+        """Return a camera's image (H, W, 3), uint8 BGR, at a stamp, s. Return None if the image is not among the detector's
+        newest images."""
         with self._lock:
             return self._cameras.image(camera, stamp)
 
     def odom_frame(self) -> str | None:
-        """Return the frame of the odometry. None while it is unknown, or if it already has a parent frame in tf."""
+        """Return the frame of the odometry. Return None while it is unknown, or if it already has a parent frame in tf."""
         with self._lock, suppress(UnknownTransform):
             odom = self._odom or find_odom(self._tf.above(self._base()))
             return odom if odom and len(self._tf.above(odom)) == 1 else None
@@ -123,8 +124,8 @@ class RosMessages:
             self.ledger.warn(message)
 
     def _takes(self, role: str, source: str) -> bool:
-        """Return whether a source is used as odometry or localization. The source that the user chose is used, else the
-        first source."""
+        """Return whether a source is used for a role, odometry or localization. The source that the user chose is used, else
+        the first source that sends."""
         if self.sources.setdefault(role, source) == source:
             return True
         if source != TF:
@@ -157,7 +158,7 @@ class RosMessages:
             return
         if (frame, child) != (self._odom, self._child):
             self._odom, self._child = frame, child
-            with suppress(UnknownTransform):  # tf may not give a localisation yet.
+            with suppress(UnknownTransform):  # Perhaps tf gives no localisation yet.
                 self._correct(frame)
         self._push_odometry(stamp, pose, covariance)
 
@@ -210,7 +211,8 @@ class RosMessages:
             self._sink.push_localization(stamp, self._tf.at(world, base, stamp))
 
     def _news(self, top: str, base: str) -> float | None:
-        """Return the newest stamp, s, of top_T_base in tf. None if it has not changed, or if all transforms are static."""
+        """Return the newest stamp, s, of top_T_base in tf. Return None if it has not changed, or if all transforms are
+        static."""
         before, self._tf_stamp = self._tf_stamp, self._tf.newest(top, base)
         return None if self._tf_stamp == before else self._tf_stamp
 
@@ -261,6 +263,6 @@ def _stamp(header: Any, received: float) -> float:
 
 
 def _covariance(values: Any) -> Floats | None:
-    """Return a covariance (6, 6). None if the message does not fill it in."""
+    """Return a covariance (6, 6). Return None if the message does not fill it in."""
     matrix = np.array(values, dtype=np.float64)
     return matrix.reshape(6, 6) if matrix.size == 36 and np.isfinite(matrix).all() and matrix.any() else None

@@ -8,11 +8,11 @@ from objslam.live.ros.message_handler import RosMessages
 from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGES, ODOMETRY, POSES, TRANSFORMS, is_boxes
 from objslam.ros.topics import LISTED, NONE, TF, TF_ROLES, Choices, closeness, namespace, warn_of_choice
 
-_NO_COLOUR = ("depth", "infra", "theora", "disparity")  # Words in the names of image topics without readable colour images.
+_NO_COLOUR = ("depth", "infra", "theora", "disparity")  # Words in names of image topics whose images are not used.
 LOOK_EVERY = 0.2  # The time between two searches of an adapter for topics, s. A larger value finds a new topic later.
-HEAD_START = 1.0  # The time to find all publishers before one of several is chosen, s. A larger value starts sessions later.
+HEAD_START = 1.0  # The time to find publishers before one of several is chosen, s. A larger value starts sessions later.
 STOP_WAIT = 0.05  # The time until an adapter notices a stop, s. A smaller value wakes it more often without need.
-LONELY = 5.0  # The time without a publisher of a topic, s, after which a warning says so. A larger value warns later.
+LONELY = 5.0  # The time without a publisher of a topic, s, after which the user is warned. A larger value warns later.
 QUEUE = 1000  # The most waiting messages of a topic, except images: 5 s of odometry at 200 Hz. A larger number costs memory.
 
 
@@ -28,9 +28,9 @@ class TopicChoice:
     def wanted(self, offered: Mapping[str, str], messages: RosMessages, settled: bool) -> set[str]:
         """Return the wanted topics. offered: the types of all topics, by name.
 
-        settled: whether probably all topics are known. Only then, if the user did not choose, one topic is chosen for the
-        odometry (the shortest name) and one for the images (`_colour`). A warning names the other topics that fit. Topics of
-        other robots are left out.
+        settled: whether probably all topics are known. Before that, no topic is chosen for the user. After that, the
+        odometry topic with the shortest name and one image topic (`_colour`) are chosen, unless the user chose. A warning
+        names the other topics that fit. Topics of other robots are left out.
         """
         offered = self._of_one_robot(offered, messages.ledger, settled)
         names = sorted(offered, key=lambda name: (len(name), name))
@@ -45,11 +45,12 @@ class TopicChoice:
         return picked
 
     def _of_one_robot(self, offered: Mapping[str, str], ledger: Ledger, settled: bool) -> Mapping[str, str]:
-        """Return the topics without those of other robots.
+        """Return the topics without the topics of other robots.
 
-        If each tf topic is in a namespace, each of these namespaces is a robot. Two may have frames of the same names.
-        Then the namespaces of the tf topics that the user chose are used. Without such a choice, the first with a topic that
-        the user chose is used, else the one with the shortest name. Until all is settled, none of them is used.
+        If each tf topic is in a namespace, each such namespace is a robot. Two robots may have frames of the same names, so
+        their topics must not be mixed. The namespaces of the tf topics that the user chose are used. Without such a choice,
+        the first namespace with a topic that the user chose is used, else the namespace with the shortest name. Until
+        `settled` is True, no robot is chosen for the user.
         """
         chosen = [name for role in TF_ROLES for name in self.chosen.of(role)]
         spaces = {namespace(name) for name, type_ in offered.items() if type_ in TRANSFORMS and _leaf(name) in TF_ROLES}
@@ -78,7 +79,7 @@ class TopicChoice:
                 ledger.warn(f"--topic {role}={name}: nobody publishes {name} (topics that fit {role}: {listed})")
 
     def _plain(self, name: str, type_: str) -> bool:
-        """Return whether a topic is wanted regardless of the other topics."""
+        """Return whether a topic is wanted, whatever the other topics are."""
         if type_ in TRANSFORMS:
             last = _leaf(name)
             return last in ("tf", "tf_static") and self._allows(last, name, default=True)
@@ -119,7 +120,7 @@ def _fits(role: str, type_: str) -> bool:
 
 
 def _colour(names: list[str], offered: Mapping[str, str]) -> list[str]:
-    """Return the topics of colour images: first topics with a CameraInfo beside them, and uncompressed before compressed."""
+    """Return the topics of colour images. Topics with a CameraInfo beside them come first, and then uncompressed topics."""
     infos = [name for name in names if offered[name] == CAMERA_INFO]
     images = [n for n in names if offered[n] in IMAGES and not any(word in n.lower() for word in _NO_COLOUR)]
     near = {name: max((closeness(info, name) for info in infos), default=0) for name in images}

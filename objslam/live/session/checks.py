@@ -23,16 +23,16 @@ from objslam.sources.journal.records import FrameMessage
 
 _LONGEST_NAME = 1000  # The most characters of a camera's name. A larger number accepts longer names.
 _LETTERS = 80  # The most characters that a report shows of a text in a message. A larger number makes longer lines.
-_NUMBERS = "iufO"  # The kinds of numpy arrays that may hold numbers: signed and unsigned integers, floats, and objects.
-_MOST_COEFFICIENTS = max(map(max, COEFFICIENTS.values()))  # Above it, a count is not told, so reports of cameras stay few.
+_NUMBERS = "iufO"  # The numpy kinds of arrays that may hold numbers: signed and unsigned integers, floats, and objects.
+_MOST_COEFFICIENTS = max(map(max, COEFFICIENTS.values()))  # A model never has more. Larger counts are not reported.
 _SHARE = "box between 0 and 1, a share of the image instead of px"  # The reason for which such a box is dropped.
 _EXACT = 2**53  # The bound below which a float represents every whole number exactly.
 
 
 def floats(values: object, *shape: int) -> Floats | None:
-    """Copy values into an array of a shape, None if that fails. An empty list fits every shape that has a 0 in it."""
+    """Copy values into an array of a shape. Return None if that fails. An empty list fits every shape that contains a 0."""
     if type(values) is np.ndarray and values.dtype == np.float64 and values.shape == shape:
-        return values.copy()  # Nearly all messages. They need no protection against what a foreign object may raise.
+        return values.copy()  # Nearly all messages end here. A plain array raises no errors of a foreign object.
     found = _array(values, np.float64)
     if found is None or found.shape == shape:
         return found
@@ -40,7 +40,7 @@ def floats(values: object, *shape: int) -> Floats | None:
 
 
 def track_numbers(values: object, count: int) -> Ints | None:
-    """Copy the ids of `Sink.push_detections` into an array (count,), with -1 for unknown ids. None if they are invalid."""
+    """Copy the ids of `Sink.push_detections` into an array (count,), -1 for unknown ids. Return None for invalid ids."""
     if values is None:
         return np.full(count, -1, dtype=np.int64)
     found = _array(values)
@@ -55,7 +55,7 @@ def track_numbers(values: object, count: int) -> Ints | None:
 
 
 def stamp_of(value: object) -> float | None:
-    """Return a stamp, s. None if the value is no number, not finite or out of range."""
+    """Return a stamp, s, or None if the value is not a number, not finite or out of range."""
     if type(value) is float:
         return value if abs(value) <= MAX_LIVE_STAMP else None
     found = floats(value)
@@ -75,7 +75,7 @@ def stamp_fault(value: object) -> str:
 
 
 def label_list(labels: object) -> tuple[object, ...] | None:
-    """Return labels as a tuple. None for a text, an unordered collection or more than MAX_BOXES labels."""
+    """Return labels as a tuple. Return None for a text, an unordered collection or more than MAX_BOXES labels."""
     if isinstance(labels, str | bytes | Mapping | Set) or not _is_short(labels):
         return None
     try:
@@ -97,7 +97,7 @@ def told(value: object) -> str:
 
 
 def rigid(pose: object) -> Floats | None:
-    """Copy a rigid pose into an array (4, 4) with an exact rotation. None if `validity.rigid_pose` refuses it."""
+    """Copy a rigid pose into an array (4, 4) with an exact rotation, or return None if `validity.rigid_pose` refuses it."""
     matrix = floats(pose, 4, 4)
     return None if matrix is None else rigid_pose(matrix)
 
@@ -174,7 +174,8 @@ def _are_shares(corners: Floats) -> Bools:
 
 
 def _array(values: object, dtype: type | None = None) -> NDArray[Any] | None:
-    """Copy values into an array. None if they are too many or form no array of numbers. Booleans are no numbers here."""
+    """Copy values into an array. Return None for too many values, or if they form no array of numbers. Booleans are no
+    numbers here."""
     if not _is_short(values, scalar=True):
         return None
     try:

@@ -4,15 +4,15 @@ from dataclasses import dataclass, field
 
 from objslam.sources.journal.records import PathKind
 
-_SURE = 5  # The clock was set back if this many poses in a row are older than the path. A larger number is surer but slower.
-_BACK = 0.5  # A pose older than the path by less than this, s, is only late. A larger value ignores larger steps back.
-_KEPT = 8  # The earlier shifts that are kept, for stamps from before the clock changed. More shifts only cost memory.
-_MISSED = 0.005  # The assumed time, s, from the last pose before a step back to the next: a period of odometry at 200 Hz.
+_SURE = 5  # The poses in a row older than the path that show a clock set back. A larger number is surer but slower.
+_BACK = 0.5  # A pose that is older than the path by less, s, is only late. A larger value ignores larger steps back.
+_KEPT = 8  # The earlier shifts kept for stamps from before the clock changed. More shifts only cost memory.
+_MISSED = 0.005  # The assumed time, s, between the poses before and after a step back: one period at 200 Hz.
 
 
 @dataclass
 class Clock:
-    """Converts stamps to session time, in which the stamps of the path increase.
+    """Converts stamps to session time. In session time, the stamps of the path always increase.
 
     shift: the time, s, that is now added to each stamp. newest: the newest stamp of the path, in session time, s. It is -inf
     before the first pose.
@@ -24,11 +24,11 @@ class Clock:
     _shifts: list[float] = field(default_factory=list)  # Earlier values of `shift`, the newest last.
 
     def step(self, stamp: float) -> tuple[float | None, bool]:
-        """Return two values: the session time of a new pose, or None if the pose is refused, and whether the clock was set
-        back.
+        """Return two values for a new pose. The first is its session time, s, or None if the pose is refused. The second is
+        whether the robot's clock was set back.
 
-        A pose that is late or repeated is refused. The first poses after the clock was set back look late, too. A single
-        wrong stamp ahead of the others does not get here: `stamp_leaps` refuses it.
+        A pose that is late or repeated is refused. The first poses after the clock was set back also look late. A single
+        wrong stamp ahead of the others does not reach this method, because `stamp_leaps` refuses it.
         """
         time = stamp + self.shift
         if time > self.newest:
@@ -49,7 +49,7 @@ class Clock:
         return self.newest, True
 
     def place(self, stamp: float, oldest: float, latest: float) -> float:
-        """Return a stamp in session time, and leave the clock as it is. oldest, latest: session time, s.
+        """Return a stamp in session time, s, and leave the clock as it is. oldest, latest: bounds in session time, s.
 
         The newest shift that puts the stamp between `oldest` and `latest` is used. If no shift does, the present shift is
         used.
@@ -61,7 +61,7 @@ class Clock:
 
 
 class Lead:
-    """Chooses the path whose stamps set the clock. path: the chosen path, None before the first pose.
+    """Chooses the path whose stamps set the clock. path: the chosen path, or None before the first pose.
 
     The odometry leads. The localisation leads before the first odometry, and when it continues for max_gap, s, without
     odometry.

@@ -40,12 +40,13 @@ from objslam.mapping.stages.solved import SolvedDrive, without_refuted_findings,
 def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None = None) -> RunResult:
     """Return the result of a session. Association and solve alternate as in the joint mode, from the session's estimate.
 
-    If every label is one object so far, that association is solved. If many of its rays do not fit, the drive is associated
-    again, as in an offline run. If there are more rays than live.reassociate, the session's association is kept. The stages
-    after the solve are those of an offline run (`mapping/stages`).
+    If every label is the name of one object so far, the association by labels is solved. If many rays do not fit this
+    solution, the drive is associated again, as in an offline run. With more rays than live.reassociate, the session's
+    association is kept. After the solve, the stages are the same as in an offline run (`mapping/stages`).
 
-    name: of the log. journal: its file, None without one. known: a prior map. If the whole drive is found in it, the
-    result is in the frame of that map, as in an offline run. SolveError when no box could be mapped.
+    name: the name of the log. journal: the file of the journal, or None without a journal. known: a prior map. If the whole
+    drive is found in this map, the result is in its frame, as in an offline run. Raises SolveError if no box could be
+    mapped.
     """
     begin = time.perf_counter()
     ledger, found = m.counters.ledger, collect(m, name)
@@ -78,7 +79,8 @@ def _nothing_mapped(m: MapState, name: str) -> SolveError:
 
 
 def _checked(m: MapState, found: Collected, name: str) -> Drive:
-    """Return the drive of a session with the findings about its input. The poses of certainly wrong input are not solved."""
+    """Return the drive of a session with the findings about its input. Poses of input that is certainly wrong are not
+    solved."""
     settings, ledger, accepted = m.given, m.counters.ledger, m.counters.accepted()
     if m.calibration is not None:
         warn_of_others(m.calibration, found.log, settings, ledger)
@@ -105,13 +107,14 @@ def _solved_drive(found: Collected, drive: Drive, by_label: bool, ledger: Ledger
     except SolveError:
         say(drive.diagnosis, ledger)  # Wrong input is the probable reason.
         raise
-    if solution.errors is not None:  # It may have more errors, and settings for them.
+    if solution.errors is not None:  # The solution may have more errors, and settings for them.
         errors, settings = solution.errors, solution.errors.settings
     return SolvedDrive(replace(drive, settings=settings), solution, errors, before)
 
 
 def _result(m: MapState, of: DescribedDrive, where: Localization | None, journal: Path | None, seconds: float) -> RunResult:
-    """Return the result of a described drive. where: its place in a prior map, None without one. seconds: of the end."""
+    """Return the result of a described drive. where: its place in a prior map, or None. seconds: the time that the end took,
+    s."""
     drive, solution, accepted = of.found.drive, of.found.solution, m.counters.accepted()
     log, settings = drive.log, drive.settings
     counts = {"detection_frames": drive.frames, "frames_on_path": sum(m.frames.values()), "detections": drive.detections}
@@ -157,14 +160,14 @@ def _solved(found: Collected, by_label: bool, cameras: tuple[Camera, ...], setti
             ledger.add(own)
             sure = few or not by_label or settings.association.method == "by_label"
             return solution if sure else replace(solution, doubted=doubted_names(solution))
-    # A session doubts all names if one label is of a thing that moves. The whole drive shows which labels are names.
+    # A session doubts all names if one label belongs to a moving thing. The whole drive shows which labels are names.
     names = by_label or (few and may_be_by_label(settings, found.rays))
     start = None if names else InitialEstimate(found.map_T_camera, found.association, found.positions)
     return solve(found.keyframes, found.rays, cameras, settings, ledger, lambda *_: None, start, found.errors)
 
 
 def _may_have_several(solution: Solution, settings: Settings) -> bool:
-    """Return whether a label may have several objects, which no frame showed together. solution: the solution with one
+    """Return whether any label may have several objects that no frame showed together. solution: the solution with one
     object for each label."""
     if settings.association.method == "by_label":
         return False
@@ -174,9 +177,9 @@ def _may_have_several(solution: Solution, settings: Settings) -> bool:
 
 
 def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
-    """Return the recorded path at its full rate, corrected by keyframes at `stamps` (K,) with map_T_base (K, 4, 4).
+    """Return the recorded path at its full rate, corrected by keyframes at `stamps` (K,), s, with map_T_base (K, 4, 4).
 
-    Between keyframes, the path follows the odometry, if there is one, because the localisation jitters.
+    Between keyframes, the path follows the odometry if the log has odometry, because the localisation jitters.
     """
     way = log.odometry or log.localization
     assert way is not None  # There is no keyframe without a path.
@@ -187,8 +190,8 @@ def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
 def _with_kept_ids(of: DescribedDrive, found: Collected) -> DescribedDrive:
     """Return the map with the ids of the session, so that an object has the same id in the snapshots and in the result.
 
-    The objects are paired one to one with those of the session, so that the pairs share the most rays. An object without a
-    partner gets a new id.
+    The objects are paired one to one with the objects of the session, so that the pairs share the most rays. An object
+    without a partner gets a new id.
     """
     before, now = found.association, of.found.solution.association
     held = (before.object >= 0) & (now.object >= 0)
@@ -203,10 +206,10 @@ def _with_kept_ids(of: DescribedDrive, found: Collected) -> DescribedDrive:
 
 
 def _solve_joint(found: Collected, settings: Settings, ledger: Ledger) -> Solution:
-    """Return the joint solve that starts from the session's poses. The shared errors start as in an offline run.
+    """Return the solution of the joint solve from the session's poses. The shared errors start as in an offline run.
 
     With at most live.reassociate rays, with odometry and without localisation, also solve from the odometry, because the
-    session may have rejected rays early and for good. Return the solve with the lower cost.
+    session may have rejected rays early and for good. Return the solution with the lower cost.
     """
     from objslam.graph import batch_solver
     from objslam.graph.assembly import Measurements
@@ -220,7 +223,7 @@ def _solve_joint(found: Collected, settings: Settings, ledger: Ledger) -> Soluti
         return Solution(*measured, association, estimate, (), errors=errors)
 
     def cost(solution: Solution) -> float:
-        """The cost with the noise of the settings, because each solve may have found another noise."""
+        """Return the cost with the noise of the settings, because each solve may have found another noise."""
         estimate = solution.estimate
         measured = keyframes, rays, settings
         if errors is not None:

@@ -19,10 +19,10 @@ _NEVER_COVERED = "frames that the path never covered"
 
 
 class FrameQueue:
-    """Passes messages to the mapper. patient: whether frames may wait for any time.
+    """Passes messages to the mapper. patient: whether frames may wait for their poses without a limit.
 
-    lag: the time, s, from the arrival of the last mapped frame until the map contained it. worked: the `time.perf_counter`,
-    s, when a frame last left the queue.
+    lag: the time, s, from the arrival of the last mapped frame until the map contained it. worked: the time, s, by
+    `time.perf_counter`, when a frame last left the queue.
     """
 
     def __init__(
@@ -37,15 +37,16 @@ class FrameQueue:
         self._limit, self._most = settings.live.max_lag, settings.live.max_frames_waiting
         self._counters, self._mapper, self._patient = counters, mapper, patient
         self._rounds, self._locator = rounds, locator
-        # Of each frame: the corrected stamp, s, its number in the order of arrival, the message, the time of arrival, s.
+        # For each frame: the corrected stamp, s, its number in the order of arrival, the message, the time of arrival, s.
         self._waiting: list[tuple[float, int, FrameMessage, float]] = []
         self._frames = 0
-        self._newest = -np.inf  # When the newest message arrived, s. It need not be the message taken last.
+        self._newest = -np.inf  # The latest arrival of a message, s. Another message may have been taken last.
         self.lag = 0.0
         self.worked = -np.inf
 
     def take(self, message: Message, arrival: float, measured: bool = True) -> bool:
-        """Take a message, and return whether any frame left the queue. arrival: `time.perf_counter` at its arrival, s.
+        """Take a message, and return whether any frame left the queue. arrival: the time of its arrival, s, by
+        `time.perf_counter`.
 
         measured: whether the time until the map contains a frame is limited and counted. False for a journal.
         """

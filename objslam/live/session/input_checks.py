@@ -1,4 +1,5 @@
-"""The checks of the input at the end of a session: the same as before an offline run, on the boxes that gave rays."""
+"""The checks of the input at the end of a session. They are the checks before an offline run, on the boxes that gave
+rays."""
 
 from dataclasses import replace
 
@@ -15,14 +16,14 @@ from objslam.mapping.checks.finding import Finding
 
 
 def diagnose_session(log: Log, settings: Settings, ledger: Ledger) -> Diagnosis:
-    """Return the diagnosis of what a session received. log: from `with_boxes`.
+    """Return the diagnosis of what a session received. log: the log from `with_boxes`.
 
-    A joint solve comes after it, so `refuted.without_refuted` must test the findings. Wrong poses are not taken out, because
+    A joint solve comes after it, so `refuted.without_refuted` must test the findings. Wrong poses stay in the log, because
     the session has used them.
     """
     try:
         diagnosis = diagnose(log, settings, ledger)
-    except LogError as error:  # An offline run would stop here. A session keeps its map, and nobody may trust it.
+    except LogError as error:  # An offline run would stop here. A session keeps its map with a finding.
         return Diagnosis((Finding("input", str(error)),))
     return replace(diagnosis, jumps=None)
 
@@ -46,7 +47,7 @@ def _with_boxes_of(camera: CameraLog, found: Collected, rows: Ints) -> CameraLog
         boxes=rays.box[rows],
         label=rays.label[rows],
         scores=rays.score[rows],
-        depths=rays.range[rows] * rays.direction[rows, 2],  # A range is along the ray, and a depth along the optical axis.
+        depths=rays.range[rows] * rays.direction[rows, 2],  # Ranges are along the ray, depths along the optical axis.
         track_ids=rays.track_id[rows],
         label_names=rays.label_names,
     )

@@ -34,18 +34,18 @@ from objslam.sources.journal.records import (
 _MOST_CAMERAS = 256  # The most cameras of a session. A larger number costs memory if somebody makes up names.
 _MOST_LABELS = 10_000  # The most labels of a session. A larger number costs memory if somebody makes up labels.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
-_POSES = 10_000  # The poses per path that are kept to notice repeats. A larger number costs memory, 0.3 kB a pose.
-_SAME_POSE = 1e-9  # Poses of one stamp that differ by less than this, m, are one pose. It only allows for rounding.
+_POSES = 10_000  # The poses per path that are kept to notice repeats. A larger number costs 0.3 kB of memory per pose.
+_SAME_POSE = 1e-9  # Poses of one stamp that differ by less, m, are one pose. The value only allows for rounding.
 _WAIT = 2.0
-"""A stamp that leads the path by more than this, s, may be from before a change of the clock, so earlier shifts are tried. A
-larger value misses more such stamps."""
+"""The lead of a stamp over the path, s, above which the stamp may be from before a change of the clock. Earlier shifts are
+then tried for this stamp. A larger value misses more such stamps."""
 _AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.
 _ALONE = "with a stamp far ahead, which the next ones did not confirm"
 _KINDS = {CameraMessage: "cameras", MountMessage: "mounts", FrameMessage: "frames", NoteMessage: "notes"}
 
 
 class _Checked(NamedTuple):
-    """A message that was checked. push: delivers it. kind, where: its name in reports."""
+    """A message that was checked. push: a function that delivers it. kind, where: its kind and place in reports."""
 
     push: Callable[[], bool]
     kind: str
@@ -55,14 +55,14 @@ class _Checked(NamedTuple):
 class Intake:
     """A `Sink` that checks messages and delivers the valid ones.
 
-    A message whose stamp leaps ahead waits until the next messages of its publisher confirm the leap (`stamp_leaps`). Its
-    push returns True. If the next messages refute the leap, the message is dropped and counted.
+    A message whose stamp leaps ahead waits until the next messages of its publisher confirm the leap (`stamp_leaps`). The
+    push of such a message returns True. If the next messages refute the leap, the message is dropped and counted.
 
-    It converts stamps to session time, in which the stamps of the path always increase. After a restart of the robot's
-    odometry, it converts the new poses, so that they continue the old path.
+    The intake converts stamps to session time, in which the stamps of the path always increase. After a restart of the
+    robot's odometry, the intake converts the new poses so that they continue the old path.
 
-    deliver(message, arrival): takes one message at a time, in the thread that pushes, and returns whether it accepts the
-    message. It counts the messages that it refuses. arrival: s, by `time.perf_counter`.
+    deliver(message, arrival): a function that takes one message at a time, in the thread that pushes. It returns whether it
+    accepts the message, and counts the messages that it refuses. arrival: s, by `time.perf_counter`.
     """
 
     def __init__(self, settings: Settings, counters: Counters, deliver: Callable[[Message, float], bool]) -> None:
@@ -73,7 +73,7 @@ class Intake:
         self._labels: set[str] = set()
         self._stamps: dict[str, dict[float, None]] = {}  # The last stamps of frames by camera, in the order of arrival.
         self._resumed: dict[str, float] = {}  # The stamp of the last frame of each camera in a resumed journal.
-        self._resumed_path: dict[PathKind, float] = {}  # The stamp of the last pose of each path there, in session time, s.
+        self._resumed_path: dict[PathKind, float] = {}  # The last stamp of each path in that journal, in session time, s.
         self._restarts = OdometryRestarts(settings, counters)
         self._last: dict[PathKind, PoseMessage] = {}
         self._heard: dict[PathKind, OrderedDict[float, Floats]] = {}  # The newest poses by stamp, in session time, s.
@@ -180,7 +180,7 @@ class Intake:
             fault = "without a rigid pose" if matrix is None else checks.stamp_fault(stamp)
             return self._refuse(f"{path} {fault}", f"stamp {checks.told(stamp)}")
         if self._settings.poses.use not in ("auto", path):
-            self.counters.accept(f"{path}{NOT_USED}")  # The user chose so (poses.use): nothing is lost.
+            self.counters.accept(f"{path}{NOT_USED}")  # The user chose this (poses.use), so nothing is lost.
             return False
         with self._lock:
             checked = _Checked(partial(self._take_pose, path, given, matrix), path, f"stamp {given:.3f}")
@@ -287,7 +287,7 @@ class Intake:
             heard.popitem(last=False)  # A plain dict would search 10 us for its oldest entry.
 
     def _place(self, stamp: float) -> float:
-        """Return the session time of a mount, of a frame, or of a pose on the path that does not set the clock."""
+        """Return the session time, s, of a mount, of a frame, or of a pose on the path that does not set the clock."""
         return self._clock.place(stamp, self.newest - self._settings.live.max_late, self.newest + _WAIT)
 
     def _with_known_labels(self, frame: FrameMessage, where: str) -> FrameMessage:

@@ -15,8 +15,8 @@ from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 from objslam.mapping.box_offsets import SizedRays, expected_variances, offset_covariance, sides_of
 
-_MOST = 200  # The most rays that describe an object. They are spread evenly over its rays. A larger number takes longer.
-_FEW = 60  # The most rays that give the parallax of an object, as the widest angle of all pairs. More rays take longer.
+_MOST = 200  # The most rays that describe an object. They are spread evenly over all its rays. A larger number takes longer.
+_FEW = 60  # The most rays whose pairs are compared for an object's parallax. More rays take longer.
 
 
 def describe_landmark(
@@ -24,10 +24,10 @@ def describe_landmark(
 ) -> MapObject:
     """Describe the landmark in a row of `m.landmarks`, at a position (3,) m with a covariance (3, 3) m^2.
 
-    If the mean square of the landmark's normalised residuals is above 1, the covariance is multiplied by it. Box offsets are
-    added. from_graph: whether the covariance includes the drift of the map. Such a covariance may be too large. Then the
-    landmark is still resolved if its covariance relative to the last keyframe that saw it is small. sure: False if its name
-    is `contradicted`. Then the landmark is not resolved.
+    If the mean square of the landmark's normalised residuals is above 1, the covariance is multiplied by this mean square.
+    The covariance of box offsets is added. from_graph: whether the covariance includes the drift of the map. Such a
+    covariance may be too large. Then the landmark is still resolved if its covariance relative to the last keyframe that saw
+    it is small. sure: False if its name is `contradicted`. Then the landmark is not resolved.
     """
     landmarks, rays, j = m.landmarks, m.rays, int(m.landmarks.id[row])
     mine = np.flatnonzero((rays.owner == j) & rays.used)
@@ -97,7 +97,7 @@ def _rms_deg(obs: Observations, position: Floats) -> float:
 def _offsets(m: MapState, at: Ints, obs: Observations, position: Floats, extent: Floats) -> Floats:
     """Return the covariance (3, 3), m^2, that box offsets (rays.box_sigma) add to the position (3,), m, of an object.
 
-    at: the rows of its rays. obs: these rays in the map. extent: (2,) m, its width and height.
+    at: the rows of the object's rays. obs: these rays in the frame map. extent: (2,) m, the width and height of the object.
     """
     share = m.settings.rays.box_sigma
     if share == 0:
@@ -111,7 +111,8 @@ def _offsets(m: MapState, at: Ints, obs: Observations, position: Floats, extent:
 
 
 def _extent(m: MapState, at: Ints, position: Floats) -> tuple[float, float] | None:
-    """Return the width and height, m, of an object at a position; None if unknown. at: the rows of its rays."""
+    """Return the width and height, m, of an object at a position (3,), m, or None if unknown. at: the rows of the object's
+    rays."""
     row = np.searchsorted(m.keyframes.id, m.rays.keyframe[at])
     frames, index = np.unique(row, return_inverse=True)
     poses = m.graph.poses(m.keyframes.id[frames])

@@ -7,19 +7,19 @@ import sys
 _SWITCH_INTERVAL = 5e-4  # The time until Python switches threads, s. A larger value costs less, but messages wait longer.
 
 _LARGE = 2**20
-"""Blocks of memory from this size on, bytes, go back to the system when they are freed. glibc itself raises the limit, up to
-32 MB, when it frees a larger block, and then keeps the memory of a calibration. A larger value keeps more, and saves
-time."""
+"""The size, bytes, from which on a block of memory goes back to the system when it is freed. Without this setting, glibc
+raises the size up to 32 MB when a larger block is freed, and then keeps the memory of a calibration. A larger value keeps
+more memory, and saves time."""
 _M_MMAP_THRESHOLD = -3  # The name of this limit in glibc's malloc.h.
 _SOON = 2
-"""A full garbage collection runs early if Python would run it after this number of smaller ones. A larger number collects
-more often. With a smaller one, more collections come while a frame is being mapped."""
+"""The number of smaller garbage collections before a full one in which the full one may run early. A larger number collects
+more often. With a smaller number, more full collections come while a frame is being mapped."""
 
 
 def configure() -> None:
-    """Switch threads sooner than Python's 5 ms. Exempt present objects from garbage collection, to save pauses of 0.15 s.
+    """Make Python switch threads sooner. Exempt present objects from garbage collection, which saves pauses of 0.15 s.
 
-    Where the C library is glibc, fix the size of the blocks that go back to the system.
+    If the C library is glibc, fix the size of the blocks that go back to the system (`_LARGE`).
     """
     sys.setswitchinterval(_SWITCH_INTERVAL)
     if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt"):
@@ -29,9 +29,10 @@ def configure() -> None:
 
 
 def collect_early() -> None:
-    """Run a full garbage collection now if one is soon due. It takes 20 ms, and else comes while a frame is being mapped.
+    """Run a full garbage collection now if one is soon due. It takes 20 ms, and may otherwise come while a frame is being
+    mapped.
 
-    Call it when there is time. Without `configure`, Python alone decides.
+    Call this function when no message waits. Without `configure`, it does nothing, and Python alone decides.
     """
     # Python counts its exempt objects one by one, which takes milliseconds. So this comes last.
     if gc.get_count()[2] > gc.get_threshold()[2] - _SOON and gc.get_freeze_count():

@@ -25,22 +25,23 @@ from objslam.live.session.landmark_description import describe_landmark
 from objslam.mapping.localization import PriorMap, at_ray_points, moved_object
 
 _EVERY, _AT = 10, 9
-"""A search is due every `_EVERY` keyframes, at the keyframe `_AT` of each period. A longer period finds the map later. `_AT`
-differs from the keyframes of the maintenance, so that the two do not delay the same frame."""
+"""The period of searches in keyframes, and the keyframe of each period with a search. With a longer period, the session is
+found later. `_AT` differs from the keyframes with maintenance, so that search and maintenance do not delay the same
+frame."""
 _MOST = 40
-"""A search compares at most this many landmarks: the ones seen last. A larger number delays the next frame for longer: 40
-landmarks in a map of 1,000 objects take 0.1 s."""
+"""The most landmarks in a search. They are the ones seen last. A larger number delays the next frame for longer. A search
+with 40 landmarks in a map of 1,000 objects takes 0.1 s."""
 _GROWTH = 1.2
-"""A search with the same landmarks is repeated when the number of keyframes has grown by this factor, because the landmarks
-are more exact by then. A larger factor searches more rarely."""
+"""The factor by which the number of keyframes grows before a search with the same landmarks is repeated. By then, the
+landmarks are more exact. A larger factor searches more rarely."""
 _SAME_PLACE = 0.5
-"""A new registration replaces the old one if it moves the middle of the matched landmarks by more than this, m. A larger
-value keeps a wrong place for longer."""
+"""The shift, m, of the middle of the matched landmarks above which a new registration replaces the old one. A larger value
+keeps a wrong place for longer."""
 
 
 @dataclass(frozen=True)
 class _Search:
-    """A search: the ids of its landmarks, and the number of keyframes at its time."""
+    """A search that was made: the ids of its landmarks, and the number of keyframes when it was made."""
 
     landmarks: tuple[int, ...]
     keyframes: int
@@ -49,7 +50,7 @@ class _Search:
 class MapLocator:
     """Searches for a session in a prior map after keyframes. Without a prior map, it does nothing.
 
-    told: the outcome of the last search, None before the first one.
+    told: the outcome of the last search, or None before the first search.
     """
 
     def __init__(self, known: PriorMap | None, mapper: Mapper, counters: Counters) -> None:
@@ -57,7 +58,7 @@ class MapLocator:
         if known is not None:  # Landmarks are where rays meet. Objects of a map may be at the centres of bodies instead.
             self._known = replace(known, objects=at_ray_points(known.objects))
         self._last: _Search | None = None
-        self._matched: dict[int, int] = {}  # By id of a landmark: the index of its object in the prior map.
+        self._matched: dict[int, int] = {}  # The index of an object in the prior map, by the id of its landmark.
         self.told: InPriorMap | None = None
 
     def after_keyframe(self) -> bool:
@@ -158,10 +159,11 @@ class MapLocator:
 
 
 def _recent_objects(m: MapState, rows: Ints) -> tuple[ObjectMap, Floats]:
-    """Return the resolved landmarks in these rows, and their covariances (n, 3, 3), m^2, in the graph.
+    """Return the resolved landmarks in rows (n,), and their covariances in the graph, m^2, one (3, 3) for each resolved
+    landmark.
 
-    The covariances are relative to the newest keyframe, because earlier drift moves all landmarks alike. The state stays as
-    it is, because a search that finds nothing must not change the map.
+    The covariances are relative to the newest keyframe, because earlier drift moves all landmarks alike. This function does
+    not change the state, because a search without a match must not change the map.
     """
     newest = int(m.keyframes.id[m.keyframes.stamp.argmax()])
     m.graph.refresh()
@@ -176,6 +178,7 @@ def _recent_objects(m: MapState, rows: Ints) -> tuple[ObjectMap, Floats]:
 
 
 def _apart(a: Floats, b: Floats, points: Floats) -> float:
-    """Return the distance (m) between the middle of points (n, 3) moved by `a` (4, 4), and the same middle moved by `b`."""
+    """Return the distance (m) between two images of the middle of points (n, 3): moved by `a` (4, 4), and moved by `b` (4,
+    4)."""
     middle = np.append(points.mean(axis=0), 1.0)
     return float(np.linalg.norm((a @ middle - b @ middle)[:3]))

@@ -1,4 +1,4 @@
-"""How much the unknown scale of a map from odometry adds to the covariances of a snapshot."""
+"""Computes how much the unknown scale of a map from odometry adds to the covariances of a snapshot."""
 
 import numpy as np
 
@@ -10,11 +10,11 @@ _SCALE = "odometry.scale"  # The name of this error among the shared errors.
 
 
 def scale_sigma(m: MapState) -> float:
-    """Return the standard deviation of the scale of the map, as a share. 0 if the scale is known, or not estimated.
+    """Return the standard deviation of the scale of the map, as a share. It is 0 if the scale is known, or not estimated.
 
-    The odometry's metre may be too long or too short, and all distances of the map with it. The graph takes it as exact. A
-    localisation or a prior map knows the metre. Else the calibration that last corrected the map tells how well it is known,
-    or the calibration file. Without one, the priors of the odometry and of the ranges do.
+    If the odometry's metre is too long or too short, so are all distances of the map. The graph takes this metre as exact.
+    With a localisation or a prior map, the metre is known. Else the calibration that last corrected the map gives its
+    uncertainty, or the calibration file. Without either, the priors of the odometry and of the ranges give it.
     """
     if m.keyframes.localized.any() or map_T_graph(m.graph) is not None:
         return 0.0
@@ -30,7 +30,7 @@ def scale_sigma(m: MapState) -> float:
 def scale_covariances(m: MapState, positions: Floats) -> Floats:
     """Return the covariances (N, 3, 3), m^2, that the scale of the map adds to positions (N, 3), m, of a session.
 
-    A map with another scale has all things farther from the start, where its frame begins, by the same share.
+    With another scale, the distances of all things from the start, where the map's frame begins, change by the same share.
     """
     sigma = scale_sigma(m)
     if sigma == 0 or not len(m.keyframes.id):

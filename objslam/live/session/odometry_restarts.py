@@ -1,4 +1,4 @@
-"""The odometry of a session in one coordinate frame, even if the robot's odometry restarts."""
+"""Keeps the odometry of a session in one coordinate frame, even if the robot's odometry restarts."""
 
 import math
 
@@ -10,8 +10,8 @@ from objslam.core.geometry import inverse, motion_between
 from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.live.counters import Counters
 
-_JUMP = 0.1  # A step is a restart if it exceeds live.max_speed by this, m. A larger value misses more restarts.
-_TURN = 0.3  # A turn is a restart if it exceeds _TURNS_PER_M by this, rad. A larger value misses more restarts.
+_JUMP = 0.1  # The excess of a step over live.max_speed, m, that shows a restart. A larger value misses more restarts.
+_TURN = 0.3  # The excess of a turn over _TURNS_PER_M, rad, that shows a restart. A larger value misses more restarts.
 _TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value misses more restarts.
 
 
@@ -26,9 +26,10 @@ class OdometryRestarts:
         self.start_T_odom = np.eye(4)
 
     def continued(self, odom_T_base: Floats, last: Floats | None, gap: float) -> tuple[Floats, bool]:
-        """Return a pose (4, 4) in the frame of the first odometry, and whether the odometry has restarted before it.
+        """Return a pose (4, 4) in the frame of the first odometry, and whether the odometry has restarted before this pose.
 
-        last: the pose before it, in the frame of the first odometry, None if there is none. gap: the time since then, s.
+        last: the previous pose (4, 4), in the frame of the first odometry, or None. gap: the time since the previous pose,
+        s.
         """
         pose = np.asarray(self.start_T_odom @ odom_T_base)
         if last is None:
@@ -42,7 +43,7 @@ class OdometryRestarts:
         return np.asarray(self.start_T_odom @ odom_T_base), True
 
     def _jumped(self, odom_T_base: Floats, pose: Floats, last: Floats, gap: float) -> bool:
-        """Return whether the motion is too large for any robot, or the odometry counts from 0 again after a gap."""
+        """Return whether the motion is too large for any robot, or the odometry begins at 0 again after a gap."""
         moved = motion_between(last, pose)
         way, turn = math.hypot(*moved.way), moved.angle
         if way > self._fast * gap + _JUMP or turn > _TURNS_PER_M * self._fast * gap + _TURN:

@@ -37,10 +37,10 @@ from objslam.sources.journal.journal import Journal
 from objslam.sources.journal.reader import corrections, messages
 from objslam.sources.journal.records import FrameMessage, Message, NoteMessage
 
-_MOST_POSES = 20_000  # The most messages, except frames, that wait: 100 s of odometry at 200 Hz. More cost memory.
+_MOST_POSES = 20_000  # The most waiting messages except frames: 100 s of odometry at 200 Hz. A larger number costs memory.
 _IDLE = 0.05
-"""The longest sleep of the thread, s. If no frame came for this time, a requested snapshot is made. A larger value makes
-snapshots later."""
+"""The longest sleep of the thread, s. If no frame came for this time, a requested snapshot is made. With a larger value,
+snapshots come later."""
 _SHORT = 0.015  # If the last messages took less than this, s, a snapshot follows at once. A larger value delays more frames.
 _LONG = 0.5  # If a caller waits longer than this, s, a snapshot may delay frames. A larger value makes snapshots later.
 _PATIENCE = 5.0  # The longest wait for a new snapshot, s. A larger value keeps the caller waiting longer.
@@ -91,13 +91,13 @@ class Session(Intake):
         self._taken: deque[tuple[Message, float]] = deque()
         self._frames = self._others = 0  # How many frames and how many other messages are in the queue.
         self._changed = threading.Condition()
-        self._wanted = self._given = 0  # How many snapshots were asked for, and how many of these requests were answered.
+        self._wanted = self._given = 0  # How many snapshots were requested, and how many requests were answered.
         self._busy = self._running = self._stopping = False
         self.failure: Exception | None = None
         self._thread = threading.Thread(target=self._work, name="objslam session", daemon=True)
         self._bodies = BodyEstimator()
         self._describer = Describer(self._bodies)
-        self._asked = -np.inf  # When the oldest request without an answer came, s (`time.perf_counter`).
+        self._asked = -np.inf  # When the oldest unanswered request came, s (`time.perf_counter`).
         self._snapshot = Snapshot(np.nan, ObjectMap(()), Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
 
     def start(self) -> Self:
@@ -113,9 +113,9 @@ class Session(Intake):
         return self
 
     def snapshot(self) -> Snapshot:
-        """Return the present map, or the last one if the session has stopped or is busy for several seconds.
+        """Return the present map, or the last snapshot if the session has stopped or is busy for several seconds.
 
-        The counts are always the present ones: a session that does not run counts what it refuses.
+        The counts are always up to date, because a session that does not run counts the messages that it refuses.
         """
         found = self._present()
         return replace(found, counters=self.counters.accepted(), dropped=self.counters.dropped())
@@ -145,7 +145,7 @@ class Session(Intake):
         """Process the pushed messages, end the thread, solve the whole map once more, and return the result.
 
         After a `failure`, the result covers the messages before it, and the ledger gets a warning. Raises the `failure` if
-        there is no result. SolveError when no box could be mapped.
+        no result can be made, and SolveError if no box could be mapped.
         """
         self._close()
         if self.failure is not None:
@@ -182,7 +182,7 @@ class Session(Intake):
                 self.counters.ledger.warn(str(error))
 
     def _enqueue(self, message: Message, arrival: float) -> bool:
-        """Put a message into journal and queue, or into neither, and return whether it was accepted.
+        """Put a message into the journal and the queue, or into neither. Return whether the message was accepted.
 
         A note, which stores the state of the clock and of the odometry's frame, only goes into the journal.
         """
@@ -270,7 +270,7 @@ class Session(Intake):
                 low_latency.collect_early()
 
     def _guard(self, work: Callable[[], object]) -> None:
-        """Call `work`, and keep its error as the session's `failure`, unless there is an earlier failure."""
+        """Call `work`, and keep its error as the session's `failure`, unless an earlier failure is kept."""
         try:
             work()
         except Exception as error:  # noqa: BLE001 - `failure` reports it, because nothing catches what a thread raises
@@ -294,8 +294,8 @@ class Session(Intake):
         return _IDLE if self._wanted == self._given else max(0.0, self._frames_waiting.worked + _IDLE - time.perf_counter())
 
     def _has_time(self, worked: bool, begin: float) -> bool:
-        """Return whether to make a snapshot now: no frame came for a while, the last messages were quick, or the wait is
-        long.
+        """Return whether to make a snapshot now. The time is right if no frame came for a while, if the last messages were
+        quick, or if the caller has waited for long.
 
         worked: whether a frame was just processed. begin: when the last messages were taken, s (`time.perf_counter`).
         """
@@ -303,7 +303,7 @@ class Session(Intake):
         return now - self._frames_waiting.worked > _IDLE or (worked and (now - begin < _SHORT or now - self._asked > _LONG))
 
     def _answer(self) -> bool:
-        """Make the snapshot that was asked for, and return whether there was one."""
+        """Make the requested snapshot, and return whether a snapshot was requested."""
         wanted = self._wanted
         if wanted == self._given and not self._stopping:
             return False

@@ -19,19 +19,19 @@ from objslam.live.names.contradicted import contradicted
 from objslam.live.session.landmark_description import describe_landmark, describe_track
 from objslam.live.session.map_scale import scale_covariances
 
-_BUDGET = 0.012  # The time for a snapshot, s. A larger value delays frames. A smaller value leaves more descriptions old.
+_BUDGET = 0.012  # The time limit of a snapshot, s. A larger value delays frames. A smaller value keeps older descriptions.
 
 
 class Describer:
     """Describes the objects of a map, and keeps each description until its object is seen again."""
 
     def __init__(self, bodies: BodyEstimator | None = None) -> None:
-        """Prepare for a session. bodies: gives the landmarks bodies, None for points only."""
+        """Prepare for a session. bodies: gives bodies to the landmarks. With None, all landmarks are points."""
         self._bodies = bodies
         # By landmark id: the number of its rays, its last stamp, s, and whether its name was contradicted, when it was
         # described, and the description.
         self._described: dict[int, tuple[tuple[int, float, bool], MapObject]] = {}
-        self._covariances: dict[int, Floats] = {}  # (3, 3) m^2, in the graph, of the described landmarks, by id.
+        self._covariances: dict[int, Floats] = {}  # By landmark id: the covariance (3, 3), m^2, in the graph.
         # By track id: the number of its rays when it was described, and the description.
         self._waiting: dict[int, tuple[int, MapObject]] = {}
         self._tied = False  # Whether the covariances of the descriptions are relative to a prior map.
@@ -39,11 +39,10 @@ class Describer:
     def map(self, m: MapState, whole: bool = False) -> ObjectMap:
         """Return first the landmarks, in the order of ids, and then the tracks with enough rays, as unresolved objects.
 
-        After the time budget is spent, objects keep their last description, but landmarks get their present position.
-        New landmarks get a covariance from their rays and the widest one of the others for now, and new tracks are left out.
-        At least one covariance comes from the graph, however busy the machine is. Else nothing would contain the error of
-        the path.
-        whole: ignore the time budget.
+        After the time budget is spent, objects keep their last description, but landmarks get their present position. A new
+        landmark gets a preliminary covariance: the covariance from its rays plus the widest covariance of the other
+        landmarks. New tracks are left out. At least one covariance comes from the graph, however busy the machine is.
+        Without it, no covariance would contain the error of the path. whole: whether to ignore the time budget.
         """
         end = np.inf if whole else time.perf_counter() + _BUDGET
         m.graph.refresh()
@@ -54,7 +53,7 @@ class Describer:
         found: dict[int, tuple[tuple[int, float, bool], MapObject]] = {}
         against, widest = contradicted(m), None
         described_at = np.array([known[j][0][1] if j in known else -np.inf for j in landmarks.id.tolist()])
-        order = np.lexsort((-landmarks.id, described_at))  # Of new ones the newest first, which the path errs most for.
+        order = np.lexsort((-landmarks.id, described_at))  # Of new landmarks, the newest first. Their path error is largest.
         for row in order.tolist():
             j = int(landmarks.id[row])
             sure = not against[row]
@@ -90,22 +89,22 @@ class Describer:
         return ObjectMap(tuple(objects))
 
     def _widest(self, landmarks: LandmarkTable) -> Floats | None:
-        """Return the widest covariance (3, 3), m^2, of a landmark that is known from the graph, None if none is known. The
-        rays of a new landmark leave out the error of the path, which this one contains."""
+        """Return the widest covariance (3, 3), m^2, that the graph gave for a landmark, or None if it gave none. It contains
+        the error of the path. A covariance from the rays of a new landmark does not."""
         known = [self._covariances[j] for j in landmarks.id.tolist() if j in self._covariances]
         return max(known, key=lambda one: np.nan_to_num(np.trace(one), nan=-1.0), default=None)
 
     def _covariance(self, m: MapState, j: int) -> Floats:
         """Return the covariance (3, 3), m^2, of landmark j, along the axes of the session.
 
-        It is relative to the prior map if the session is tied to one and this covariance is known. Else it is relative to
-        the frame of the session.
+        If the session is tied to a prior map and the covariance relative to this map is known, it is returned. Else the
+        covariance is relative to the frame of the session.
         """
         covariance = covariance_in_map(m.graph, j) if self._tied else np.full((3, 3), np.nan)
         return covariance if np.isfinite(covariance).all() else m.graph.point_covariance(j)
 
     def _wait(self, m: MapState, track: Track, whole: bool, end: float) -> tuple[int, MapObject] | None:
-        """Return the number of rays and the description of a track; None for a new track after `end`, s."""
+        """Return the number of rays and the description of a track. Return None for a new track after the time `end`, s."""
         before = self._waiting.get(track.id)
         if not whole and ((before is not None and before[0] == len(track.rays)) or time.perf_counter() > end):
             return before
@@ -124,7 +123,7 @@ def _of_unknown_scale(m: MapState, objects: list[MapObject]) -> list[MapObject]:
 
 
 def take_snapshot(m: MapState, describer: Describer, lag: float, whole: bool) -> Snapshot:
-    """Return a snapshot of a map. lag: `Snapshot.lag`, s. whole: ignore the time budget of the descriptions."""
+    """Return a snapshot of a map. lag: `Snapshot.lag`, s. whole: whether to ignore the time budget of the descriptions."""
     return Snapshot(
         stamp=float(m.keyframes.stamp.max()) if len(m.keyframes) else np.nan,
         map=describer.map(m, whole),
@@ -142,15 +141,15 @@ def take_snapshot(m: MapState, describer: Describer, lag: float, whole: bool) ->
 
 
 def _path(m: MapState) -> Trajectory:
-    """Return map_T_base of all keyframes by the estimate at the graph's last refresh."""
+    """Return the path map_T_base of all keyframes, as the graph estimated it at its last refresh."""
     k = m.keyframes
     stamps, first = np.unique(k.stamp, return_index=True)
     return Trajectory(stamps, m.graph.poses(k.id[first]) @ inverse(k.base_T_camera[first]))
 
 
 def _map_T_odom(m: MapState) -> Floats | None:
-    """Return `Snapshot.map_T_odom` (4, 4) for the odometry as it was received, because tf has the received odometry. None in
-    a gap of the odometry."""
+    """Return `Snapshot.map_T_odom` (4, 4) for the odometry as it was received, because tf has the received odometry. Return
+    None in a gap of the odometry."""
     k, driven = m.keyframes, m.course.driven
     if not len(k) or not len(driven):
         return None

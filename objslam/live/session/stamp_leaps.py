@@ -1,7 +1,7 @@
 """Messages whose stamps leap ahead. They wait until the next messages of their stream confirm or refute them.
 
-A stream is what one publisher sends: a path, or the frames or the mounts of a camera. So a single wrong stamp moves no
-clock, and a real gap, or a clock that is set forward, costs no message.
+A stream is what one publisher sends: a path, the frames of a camera, or the mounts of a camera. Because of the wait, a
+single wrong stamp moves no clock. A real gap, or a clock that is set forward, loses no message.
 """
 
 from collections import deque
@@ -9,15 +9,15 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 _SURE = 3
-"""A leap is real if this many messages in a row confirm it. A larger number is surer, and the first messages after a gap
-wait longer."""
+"""The number of messages in a row that confirm a leap. With a larger number, wrong stamps pass more rarely, but the first
+messages after a gap wait longer."""
 _LAG = 0.3
-"""A stamp is no leap if it is ahead by less, s. This covers the usual lags between topics. With a larger value, a wrong
-stamp can move the clock further, and fewer messages wait after short pauses."""
+"""The lead, s, below which a stamp is no leap. This covers the usual lags between topics. With a larger value, a wrong stamp
+can move the clock further, and fewer messages wait after short pauses."""
 _STEPS = 3.0
-"""A stamp is no leap within this many usual steps of its stream. A larger value acts on slow streams like a larger
+"""The lead, in usual steps of the stream, up to which a stamp is no leap. A larger value acts on slow streams like a larger
 `_LAG`."""
-_KEPT = 8  # The last steps whose median is the usual one. A larger number adapts later to another rate.
+_KEPT = 8  # The number of last steps whose median is the usual step. With a larger number, a new rate is learned later.
 _APART = 60.0
 """The longest step, s, between messages that confirm each other. It is also the longest step that is no leap in a stream
 whose usual step is not known yet. Frames that are further ahead wait for the path. With a larger value, more wrong stamps
@@ -29,27 +29,27 @@ T = TypeVar("T")
 
 @dataclass
 class _Stream(Generic[T]):
-    """One stream of messages: its newest stamp, the last steps (s) between its stamps, and the waiting messages with their
-    stamps."""
+    """One stream of messages. last: its newest stamp, s. steps: the last steps between its stamps, s. waiting: the waiting
+    messages with their stamps."""
 
     last: float | None = None
     steps: deque[float] = field(default_factory=lambda: deque(maxlen=_KEPT))
     waiting: list[tuple[float, T]] = field(default_factory=list)
 
     def hear(self, stamp: float) -> None:
-        """Take note of a message that passes."""
+        """Record the stamp, s, of a message that passes."""
         if self.last is not None and stamp > self.last:
             self.steps.append(stamp - self.last)
         self.last = stamp if self.last is None else max(self.last, stamp)
 
     def reach(self, stamp: float) -> float:
-        """Return the latest stamp, s, that is no leap from a stamp."""
+        """Return the latest stamp, s, that is no leap after a given stamp, s."""
         usual = sorted(self.steps)[(len(self.steps) - 1) // 2] if self.steps else None
         return stamp + (_APART if usual is None else max(_LAG, _STEPS * usual))
 
     def leaps(self, stamp: float, clock: float, alone: bool) -> bool:
         """Return whether a stamp is too far ahead of its stream, and of the clock of the other streams."""
-        if clock == -float("inf") and not (alone and self.last is not None):  # There is nothing to compare it with.
+        if clock == -float("inf") and not (alone and self.last is not None):  # No other stamp can refute it.
             return False
         return stamp > clock + _LAG and (self.last is None or stamp > self.reach(self.last))
 
@@ -88,9 +88,9 @@ class StampLeaps(Generic[T]):
     def take(self, stream: str, stamp: float, clock: float, message: T, alone: bool) -> tuple[list[T], list[T]]:
         """Take the next message of a stream. Return the messages that pass, in order, and the refuted messages.
 
-        clock: the newest stamp, s, of another stream, -inf if there is none. It confirms stamps that are not far ahead of
-        it. alone: whether the stream itself may confirm a leap of more than `_APART`, as a path may. If not, such a leap
-        waits for the clock.
+        clock: the newest stamp, s, of another stream, or -inf without one. It confirms stamps that are not far ahead of it.
+        alone: whether the stream itself may confirm a leap of more than `_APART`, as a path may. If not, such a leap waits
+        for the clock.
         """
         s = self._streams.setdefault(stream, _Stream())
         before = s.last
@@ -103,17 +103,18 @@ class StampLeaps(Generic[T]):
             s.steps.clear()
             return s.pass_on(chain), s.empty()
         s.hear(stamp)
-        if not s.waiting or (before is not None and stamp <= before):  # A late message says nothing about messages ahead.
+        if not s.waiting or (before is not None and stamp <= before):  # A late message neither confirms nor refutes a leap.
             return [message], []
         earlier = s.near(stamp)
         return [*earlier, message, *s.near(s.reach(stamp))], s.empty()
 
     def confirmed(self, clock: float) -> list[T]:
-        """Return, from all streams, the waiting messages that another stream has reached. clock: its newest stamp, s."""
+        """Return the waiting messages of all streams that another stream has reached. clock: the newest stamp of that
+        stream, s."""
         return [message for s in self._streams.values() if s.waiting for message in s.near(clock + _LAG)]
 
     def recall(self, stream: str, stamp: float) -> None:
-        """Take note of a message of the stream that passed earlier."""
+        """Record the stamp, s, of a message of the stream that passed earlier."""
         self._streams.setdefault(stream, _Stream()).hear(stamp)
 
     def clear(self) -> list[T]:
