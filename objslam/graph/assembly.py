@@ -29,7 +29,7 @@ from objslam.graph.variables import make_values
 
 
 class RowsOfKind(Protocol):
-    """The factors of one kind as arrays: n factors with r rows each, on c columns each.
+    """All n factors of one kind, as arrays. Each factor has r rows, and all its rows share c columns.
 
     The columns are as in `JointRows`: three for each landmark of the graph, then six for each pose.
     """
@@ -40,20 +40,20 @@ class RowsOfKind(Protocol):
 
     @property
     def columns(self) -> Ints:
-        """(n, c) the columns that all rows of a factor share."""
+        """(n, c) the columns of each factor. All rows of a factor share them."""
 
     def rows(self, map_T_camera: Floats, landmarks: Floats) -> tuple[Floats, Floats, float]:
-        """Return the whitened residuals (n, r), their derivatives (n, r, c) and the cost, at poses (P, 4, 4) and positions
-        (m, 3), m. The residuals and the derivatives contain the roots of the robust weights."""
+        """Return the whitened residuals (n, r), their derivatives (n, r, c) and the cost at camera poses (P, 4, 4) and
+        positions (m, 3), m. Residuals and derivatives contain the roots of the robust weights."""
 
 
 @dataclass(frozen=True)
 class Measurements:
     """The measurements of a log, as P multiframes.
 
-    images: all K keyframes. keyframes: the first keyframe of each multiframe. Only these have a pose in the graph. rays: in
-    the camera frames of `keyframes`. motions: the camera motions in the graph, None without odometry. tags: the fiducials
-    whose corners are landmarks, None if there are none.
+    images: all K keyframes. keyframes: the first keyframe of each multiframe. Only these keyframes have a pose in the graph.
+    rays: all R rays, in the camera frames of `keyframes`. motions: the camera motions in the graph, None without odometry.
+    tags: the fiducials whose corners are landmarks, None without fiducials.
     """
 
     multiframes: Multiframes
@@ -92,9 +92,9 @@ class Measurements:
 
     @cached_property
     def seen_twice(self) -> Bools:
-        """(M,) whether both poses of a motion see the same fiducial. The corners of this fiducial measure the motion too.
+        """(M,) whether both poses of each motion see the same fiducial. Its corners also measure the motion.
 
-        A tie between multiframes counts if one of the motions between its ends counts.
+        A tie between multiframes is True if one of the motions between its ends is True.
         """
         if self.motions is None:
             return np.zeros(0, dtype=bool)
@@ -105,7 +105,7 @@ class Measurements:
 
     @cached_property
     def motion_factors(self) -> list[gtsam.NonlinearFactor]:
-        """The factors of `motions`. Graphs share them, as they never change."""
+        """The factors of `motions`. All graphs share these factors, because they never change."""
         of = self.motions
         return [] if of is None else betweens(of.before, of.after, of.motion, of.covariance, self.seen_twice)
 
@@ -116,7 +116,7 @@ class Measurements:
 
     @property
     def localized_factors(self) -> list[gtsam.NonlinearFactor]:
-        """The factors of `localized_motions`. Like the ties of fiducials, they belong to whole logs only."""
+        """The factors of `localized_motions`. Only the graph of a whole log contains them."""
         return [] if self.localized_motions is None else self.localized_motions.factors()
 
     def whole(
@@ -136,10 +136,10 @@ class Measurements:
         return build_graph(factors), values
 
     def further_rows(self, landmarks: Ints) -> tuple[SquareRows, *tuple[RowsOfKind, ...]]:
-        """Return the kinds of factors that bring their own rows.
+        """Return the kinds of factors that make their own rows.
 
-        `JointGraph` itself makes the rows of bearings, ranges, weak priors, motions and poses. All other kinds are returned
-        here. landmarks: (m,) the landmarks in the graph, in increasing order.
+        `JointGraph` makes the rows of bearings, ranges, weak priors, motions and poses. This method returns all other kinds.
+        landmarks: (m,) the landmarks in the graph, in increasing order.
         """
         squares, by_localization = SquareRows.of(self.tags, landmarks), self.localized_motions
         if by_localization is None:
@@ -151,9 +151,9 @@ class Measurements:
         return motions(self.keyframes, self.settings)
 
     def odometry(self) -> tuple[Floats, Floats]:
-        """Return the camera motions (P-1, 4, 4) by odometry, and their covariances (P-1, 6, 6).
+        """Return the camera motions (P-1, 4, 4) that odometry measured, and their covariances (P-1, 6, 6).
 
-        ValueError without odometry.
+        Without odometry, a ValueError is raised.
         """
         return self._steps
 
@@ -171,11 +171,11 @@ class Measurements:
 
         Args:
             owner: (R,) the landmark of each ray, or -1.
-            which: (n,) the added rays. The first n factors are their bearings, in the order of `which`.
+            which: (n,) the added rays. The first n factors are the bearings of the added rays, in this order.
             landmarks: (m,) the added landmarks.
             positions: (N, 3) m, all landmarks in map.
             loss: the loss of the bearings.
-            begin, end: the added keyframes are `begin` to `end` - 1. If `end` is None, all keyframes from `begin` on.
+            begin, end: the added keyframes are `begin` to `end` - 1. If `end` is None, they end with the last keyframe.
         """
         keyframes, settings = self.keyframes, self.settings
         end = len(keyframes) if end is None else end
@@ -201,19 +201,19 @@ def fixed_pose_factors(
     noise: tuple[Floats, float],
     loss: Loss,
 ) -> list[gtsam.NonlinearFactor]:
-    """Return the factors of rays at fixed poses: first one for each ray and its landmark, then one for each measured range.
+    """Return the factors of rays at fixed poses. The first n factors are for rays, and the others for measured ranges.
 
-    With the loss `l1`, this is Eq. 1 of Staszak & Belter: the distance of each ray from its landmark, without noise and
-    without ranges. Noise of the directions then draws a landmark towards the cameras, because the distance to a noisy ray is
-    smaller near the origin of the ray. The other losses are on x / s. Here x is the distance of the landmark from a ray, and
-    s is the standard deviation of x. At distance d, s^2 = (angle d)^2 + place^2. The residual is proportional to x / s near
-    this distance: it is the angle of the landmark, seen from a point place^2 / (angle^2 d) behind the origin. If the
-    landmark moves by 1 m along the line of sight, both change by the share d angle^2 / s^2. With this residual, neither
-    noise of directions nor noise of places moves a landmark to one side.
+    With the loss `l1`, a factor is Eq. 1 of Staszak & Belter: the distance of the landmark from the ray. This loss uses no
+    noise and no ranges. With it, noise of the directions draws a landmark towards the cameras, because the distance from a
+    noisy ray is smaller near the origin of the ray. The other losses use the noise. Let x be the distance of the landmark
+    from the ray, and s the standard deviation of x. At distance d from the origin, s^2 = (angle d)^2 + place^2. The residual
+    is the angle of the landmark, seen from a point place^2 / (angle^2 d) behind the origin. Near distance d, the residual is
+    proportional to x / s. If the landmark moves by 1 m along the line of sight, the residual and x / s both change by the
+    share d angle^2 / s^2. With this residual, neither noise of directions nor noise of origins moves a landmark to one side.
 
     Args:
         origins, directions: (n, 3), (n, 3) the rays in map.
-        landmark: (n,) the landmark of each ray. distance: (n,) m, about how far it is.
+        landmark: (n,) the landmark of each ray. distance: (n,) m, the approximate distance of the landmark from the origin.
         noise: the standard deviations of directions (n,), rad, and of origins, m.
     """
     if loss == "l1":

@@ -35,12 +35,12 @@ from objslam.graph.variables import make_values, with_points
 from objslam.triangulation.triangulate import Triangulation
 
 _TOLERANCE, _TOLERANCE_BEFORE = 1e-6, 1e-3
-"""A joint solve ends if an iteration decreases the cost by less than this share. The first value is for a solve without
-shared errors. The second is for a solve with shared errors, because their estimation moves everything again. Larger values
-end it sooner."""
+"""The smallest share by which an iteration must decrease the cost. Below this share, a joint solve ends. The first value is
+for a solve without shared errors. The second value is for a solve with shared errors, because the estimation of the errors
+moves all poses and objects again. With larger values, a solve ends sooner."""
 _ROUNDS_BEFORE = 2
-"""The most rounds of solve and test before the shared errors are estimated. The estimation tests the inliers after each of
-its steps. A larger number is slower, and leads to the same inliers."""
+"""The largest number of rounds of solve and test before the shared errors are estimated. The estimation tests the inliers
+after each of its steps. A larger number is slower, and leads to the same inliers."""
 
 
 def solve_fixed(
@@ -51,11 +51,12 @@ def solve_fixed(
     settings: Settings,
     trace: Trace | None = None,
 ) -> Estimate:
-    """Solve the objects at fixed poses, starting from the triangulation, with one factor for each inlier.
+    """Estimate the objects at fixed poses, starting from the triangulation. Each inlier ray has one factor.
 
-    The loss `l1` is Eq. 1. For this loss, the triangulation gives the covariances. It also gives the positions that Eq. 1
-    cannot give without ranges. The other losses weigh the angle of each ray by its noise, and add a factor along the ray for
-    a measured range. Objects that the triangulation did not resolve are left out.
+    The loss `l1` is Eq. 1 of Staszak & Belter. With this loss, the covariances are those of the triangulation. An object
+    that only ranges resolve keeps its triangulated position, because Eq. 1 uses no ranges. The other losses weigh the angle
+    of each ray by its noise. They add a factor along the ray for each measured range. An object that the triangulation did
+    not resolve is not solved.
     """
     loss = settings.fixed.loss
     member = start.ok & np.isfinite(start.gradient) if loss == "l1" else start.ok
@@ -118,22 +119,24 @@ def solve_joint(
     hold: bool = False,
     places: Floats | None = None,
 ) -> Estimate:
-    """Solve poses and objects together, from the poses of the localisation, or from a graph that grew along the odometry.
+    """Estimate poses and objects together.
 
-    Each solve is followed by a test of all rays. Rays far outside the noise of their object are rejected, and other rays
-    return. An object is added or moved if the poses now determine it better. Solve and test repeat until nothing changes. If
-    most rays of a stretch of the drive were rejected, and there is only odometry, the poses of the stretch may be wrong. In
-    this case, its rays return once, and the solution with the lower cost is taken. Images of one stamp share one pose. The
-    corners of fiducials are landmarks of their own inside the solve, tied to squares (`graph.tags`).
+    The solve starts from the poses of the localisation, or from a graph that grew along the odometry. Each solve is followed
+    by a test of all rays. Rays far outside the noise of their object are rejected, and other rays return. An object is added
+    or moved if the new poses determine it better. Solve and test repeat until nothing changes. If most rays of a stretch of
+    the drive were rejected, and odometry alone gives the poses, the poses of the stretch may be wrong. In this case, its
+    rays return once. The result is the solution with the lower cost. Images with the same stamp share one pose.
+    Inside the solve, each corner of a fiducial is a landmark, and a factor ties four corners to a square (`graph.tags`).
 
     Args:
         progress: called as progress(done, total) with numbers of keyframes in the growing graph.
-        start: (K, 4, 4) camera poses to start from instead.
-        places: (N, 3) m, positions to start from, NaN where unknown. They are given if `start` and `places` are the solution
-            of nearly the same measurements. Then the stretches that this solution rejects are not tried again.
-        errors: the same keyframes and rays as a function of shared errors. The shared errors are estimated, starting from
-            theta (P,) or from their mean. Their covariance is added to the covariance of objects.
-        hold: whether the shared errors stay at theta. Then the noise stays too, and no covariance is added.
+        start: (K, 4, 4) the camera poses to start from. If None, the solve starts as described above.
+        places: (N, 3) m, positions to start from, NaN where unknown. Give them only if `start` and `places` are the solution
+            of nearly the same measurements. If they are given, the rays of rejected stretches do not return.
+        errors: the same keyframes and rays as a function of shared errors. If given, the shared errors are estimated. Their
+            covariance is added to the covariance of objects.
+        theta: (P,) the values of the shared errors to start from. If None, their mean.
+        hold: whether the shared errors stay at theta. If they stay, the noise stays as well, and no covariance is added.
 
     Raises:
         SolveError: the linear system is indeterminate, or the cost is not finite.
@@ -180,8 +183,8 @@ def solve_joint(
 class _Solve:
     """A joint solve before its shared errors are estimated.
 
-    shared: what their estimation needs: the errors, the measurements as a function of them, and their values. None if there
-    are none, or if they are held. roughly: whether there are shared errors, held or not.
+    shared: the shared errors, the function that makes measurements, and the first values of the errors. None if no shared
+    errors are estimated. roughly: whether the log has shared errors, estimated or held. If so, this solve ends sooner.
     """
 
     measured: Measurements
@@ -195,8 +198,8 @@ class _Solve:
     ) -> JointSolution:
         """Return the solution with the inliers.
 
-        start: (P, 4, 4) the first poses, else those of the localisation, or of a growing graph. places: (N, 3) m, the first
-        positions, None if unknown. returns: whether the rays of rejected stretches return once.
+        start: (P, 4, 4) the first camera poses. If None, the first poses come from the localisation or from a growing graph.
+        places: (N, 3) m, the first positions, None if unknown. returns: whether the rays of rejected stretches return once.
         """
         measured, keyframes = self.measured, self.measured.keyframes
         map_T_camera = keyframes.map_T_camera if start is None else start
@@ -217,7 +220,7 @@ class _Solve:
         return self._with_returned_stretches(found) if loose else found
 
     def _with_returned_stretches(self, found: JointSolution) -> JointSolution:
-        """Return the solution after the rays of rejected stretches returned, if it has the lower cost."""
+        """Try the rays of rejected stretches again. Return the new solution if its misfit is lower, and else `found`."""
         measured, association, trace = self.measured, self.association, self.trace
         back = rejected_stretches(measured.rays, association, found)
         if not back.any():

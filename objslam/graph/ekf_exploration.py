@@ -1,10 +1,10 @@
 """Find poses, landmarks, and the landmark of each ray by an extended Kalman filter, from odometry and rays.
 
-The state is the pose, all landmarks, and errors that all motions share, such as a clock offset. Their covariance predicts
-where in a frame each landmark may appear. The rays of a frame are assigned together, because an error of the pose shifts all
-of them. A ray with a range that fits no landmark makes a new landmark. After a long way, drift makes an old landmark look
-new. So recent landmarks are tied to old ones if one drift explains all pairs much better than chance. The time for a frame
-grows with the number of landmarks, hardly with the number of frames.
+The state is the pose, all landmarks, and errors that all motions share, such as a clock offset. The covariance of the state
+predicts where in a frame each landmark may appear. The rays of a frame are assigned together, because an error of the pose
+shifts all of them. A ray with a range that fits no landmark makes a new landmark. After a long way, drift makes an old
+landmark look new. So recent landmarks are tied to old ones if one drift explains all pairs much better than chance. The time
+for a frame grows with the number of landmarks, and hardly with the number of frames.
 """
 
 from collections.abc import Callable
@@ -26,33 +26,33 @@ from objslam.graph.multiframes import Multiframes
 from objslam.graph.planar_motion import motions_by_shared_errors, planar_noise
 
 _STRETCH = 150
-"""A landmark with too few rays is dropped after this number of frames without a ray. It is dropped sooner if the heading
-drifted by `HORIZON`. The search for ties pauses after this number of frames without a new landmark or a tie. A larger number
-keeps false landmarks longer."""
+"""The number of frames without a ray after which a landmark with too few rays is dropped. It is dropped sooner if the
+heading drifted by `HORIZON`. The search for ties pauses after this number of frames without a new landmark or a tie. A
+larger number keeps false landmarks longer."""
 _RECENT = 300
-"""During this number of frames after its first ray, a landmark can be tied to an older landmark. A larger number is
+"""The number of frames after its first ray during which a landmark can be tied to an older landmark. A larger number is
 slower."""
 _SURE = 4.0
-"""The best assignment with a match is compared with the best assignment without it. The match is sure if the log odds are at
-least this. A larger value matches fewer rays."""
+"""The least log odds of a sure match. The odds compare the best assignment with the match and the best assignment without
+the match. A larger value matches fewer rays."""
 _NEW = 0.2
 """The prior probability that a ray belongs to no known landmark. A larger value accepts fewer matches."""
 _PAIRS = 40
 """The largest number of pairs that are assigned together. A larger number finds rarer assignments, and is slower."""
 _BENT = 0.07
-"""The standard deviation (m) of the distance between two estimates of one landmark, in addition to what the filter expects.
-A larger value ties more landmarks, and confuses neighbours more often."""
+"""The standard deviation (m), along each axis, of the difference of two estimates of one landmark. It is added to what the
+filter expects. A larger value ties more landmarks, and confuses neighbours more often."""
 _TIED = 0.02
 """The standard deviation (m) of the measurement that ties two landmarks: "they are one point". With a larger value, a closed
 loop corrects the path less."""
 _EXPLAINED = 0.8
-"""An exploration is reliable if at least this share of the rays has a landmark. With ranges, the share is 0.86 to 1 in
-simulated rooms and on the log Lost in the Woods. It is 0.4 to 0.65 on the MRCLAM logs, whose landmarks stand 0.18 m apart.
-With a larger limit, fewer explorations are used."""
+"""The least share of rays with a landmark in a reliable exploration. With ranges, the share is 0.86 to 1 in simulated rooms
+and on the log Lost in the Woods. It is 0.4 to 0.65 on the MRCLAM logs, whose landmarks stand 0.18 m apart. With a larger
+limit, fewer explorations are used."""
 _GAIN, _MOST, _LARGEST = 0.05, 100.0, 10.0
-"""The factors on the motion's variances grow if corrections are larger than expected. The ratio of each squared correction
-to its expectation moves a factor by the share `_GAIN`. `_MOST` is the largest factor, and `_LARGEST` the largest ratio that
-counts. Larger values adapt sooner to rough odometry, and also to outliers."""
+"""How factors on the variances of motions grow if corrections are larger than expected. A correction multiplies a factor by
+1 + `_GAIN` (r - 1). Here r is the ratio of the squared correction to its expectation. `_MOST` is the largest factor, and
+`_LARGEST` the largest r. With larger values, the factors adapt sooner to rough odometry, and also to outliers."""
 
 
 def explore(
@@ -65,11 +65,11 @@ def explore(
 ) -> InitialEstimate:
     """Return poses, landmarks and an association. A ray without a sure match has no landmark.
 
-    The exploration ends as soon as it cannot be sure any more (`is_sure`). The rays that are left have no landmark then.
+    The exploration ends as soon as `is_sure` can no longer be true. The rays that are left then have no landmark.
 
-    errors: gives the keyframes and rays for any values of the shared errors. The filter estimates these errors, starting
-    from their mean. surface: the value of the shared error of this name, which the filter does not estimate. The function
-    progress(done, total) gets numbers of keyframes.
+    errors: the keyframes and rays as a function of the shared errors. The filter estimates the shared errors, starting from
+    their mean. surface: the value of the shared error named surface, which the filter does not estimate. progress: called
+    as progress(done, total) with numbers of keyframes.
     """
     if errors is not None:
         of_surface = np.array([name == "surface" for name in errors.names], dtype=bool)
@@ -182,8 +182,8 @@ class _Exploration:
         self.roughness = np.clip(self.roughness * (1 + _GAIN * (np.minimum(ratio, _LARGEST) - 1)), 1.0, _MOST)
 
     def _stretch(self, now: int) -> int:
-        """Return the first frame after which the heading has drifted by less than `HORIZON`, at most `_STRETCH` frames
-        back."""
+        """Return the first frame of the recent stretch. Since this frame, the heading has drifted by less than `HORIZON`.
+        The stretch has at most `_STRETCH` frames."""
         return max(0, now + 1 - _STRETCH, int(np.searchsorted(self.heading, self.heading[now] - HORIZON**2)))
 
     def _add(self, position: Floats, covariance: Floats, label: Ints, first: Ints, now: int) -> None:
@@ -242,14 +242,14 @@ class _Exploration:
 
 
 def _likeliest(squared: Floats) -> Ints:
-    """Return the sorted indices (p,) of the smallest squared deviations (P,): at most `_PAIRS`, all within the gate."""
+    """Return the sorted indices (p,) of the smallest squared deviations (P,) below the gate, at most `_PAIRS` indices."""
     near = np.flatnonzero(squared <= SAME_POINT_WIDE)
     return np.sort(near[np.argsort(squared[near], kind="stable")[:_PAIRS]])
 
 
 def _log_spread(sight: ekf.Sight) -> Floats:
-    """Return the log (R,) of the area (rad^2) over which rays to new landmarks spread. For a ray with a range, it is a
-    volume (rad^2 m). All rays together serve as a sample of such rays."""
+    """Return the log (R,) of the area (rad^2) over which rays to new landmarks spread. For a ray with a range, return the
+    log of a volume (rad^2 m). The area and the volume are estimated from all rays."""
     n, noise = sight.direction, np.median(sight.sigma)
     angles = np.arctan2(n[:, 1], n[:, 0]), np.arcsin(np.clip(n[:, 2], -1.0, 1.0))
     extent = sum(0.5 * np.log(12 * np.var(angle) + 2 * np.pi * noise**2) for angle in angles)

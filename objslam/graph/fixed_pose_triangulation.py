@@ -42,9 +42,10 @@ def triangulate_landmarks(
 
 
 def flat_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Floats, float, float]:
-    """Return the noise of rays as `pose_noise` does, but as if the ground were even. Also return a factor on z. On uneven
-    ground, planar poses lack tilts and heights, so rays have more noise along z. In a world whose z is multiplied by the
-    factor, their noise is equal in all directions. The factor is `LEVEL` on a flat floor.
+    """Return the noise of rays as `pose_noise` does, but as if the ground were even. Also return a factor on z.
+
+    On uneven ground, planar poses lack tilts and heights, so rays have more noise along z. If z is multiplied by the factor,
+    the noise of rays is equal in all directions. The factor is `LEVEL` on a flat floor.
     """
     yaw, place = noise_of_poses(keyframes, settings)
     uneven = any(noise_up(keyframes, settings))
@@ -62,14 +63,14 @@ def pose_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Fl
 
 
 def largest_noise(keyframes: Keyframes, settings: Settings) -> tuple[float, float]:
-    """Return the standard deviations of localised poses along their worst axis: of rotations, rad, and of places, m."""
+    """Return the standard deviations of the rotations (rad) and places (m) of localised poses, along the worst axis."""
     (yaw, place), (tilt, z) = noise_of_poses(keyframes, settings), noise_up(keyframes, settings)
     return float(np.hypot(yaw, tilt)), float(np.hypot(place, z))
 
 
 def noise_up(keyframes: Keyframes, settings: Settings) -> tuple[float, float]:
-    """Return the standard deviations of roll and of pitch, rad, and of the height, m, that localised planar poses lack on
-    uneven ground. 0 for other poses."""
+    """Return the standard deviations of the tilt (rad, for roll and for pitch) and the height (m) that localised planar
+    poses lack on uneven ground. They are 0 for other poses."""
     tilt, z = noise_of_ground(settings)
     if not (tilt or z) or not keyframes.localized_every or not is_planar(keyframes.map_T_base):
         return 0.0, 0.0
@@ -77,10 +78,10 @@ def noise_up(keyframes: Keyframes, settings: Settings) -> tuple[float, float]:
 
 
 def noise_of_poses(keyframes: Keyframes, settings: Settings) -> tuple[float, float]:
-    """Return the standard deviations of localised poses: of headings, rad, and of places, m. 0 without a localisation.
+    """Return the standard deviations of the headings (rad) and places (m) of localised poses, 0 without a localisation.
 
-    Keyframes that share one measured pose share its error. So its variance is multiplied by the number of keyframes that can
-    show the same thing. The noise is from the settings, or the larger noise that the log shows.
+    Keyframes that share one measured pose share its error. So the variance is multiplied by the number of such keyframes
+    that can show one object. The noise is from the settings, or the larger noise that the log shows.
     """
     if not keyframes.localized_every:
         return 0.0, 0.0

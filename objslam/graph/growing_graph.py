@@ -50,16 +50,16 @@ class GrowingGraph(ABC):
             self._rebuild.later.push_back(graph)
 
     def add_keyframe(self, k: int, map_T_camera: Floats) -> None:
-        """Add X(k) at an initial pose (4, 4). It needs a motion or an absolute pose before the next update."""
+        """Add X(k) at an initial pose (4, 4). X(k) needs a motion or an absolute pose before the next update."""
         self._at.poses[k], self._newest = map_T_camera, k
         self._insert(X0 + k, gtsam.Pose3(map_T_camera))
 
     def add_motion(self, before: int, after: int, motion: Floats, covariance: Floats) -> None:
-        """Add the camera motion (4, 4) with covariance (6, 6) from X(before) to X(after), by odometry."""
+        """Add the camera motion (4, 4) by odometry from X(before) to X(after), with its covariance (6, 6)."""
         self.add("motion", [after], [[between(before, after, motion, covariance)]])
 
     def drop_motion(self, k: int) -> None:
-        """Remove the motion to X(k), if there is one."""
+        """Remove the motion to X(k). Without such a motion, do nothing."""
         self._store.drop("motion", [k])
 
     def before(self, k: int) -> int | None:
@@ -76,7 +76,7 @@ class GrowingGraph(ABC):
         self.add("absolute", [k], [[factor]])
 
     def add_landmark(self, j: int, position: Floats) -> None:
-        """Add L(j) at an initial position (3,) with a weak prior. It needs rays before the next update."""
+        """Add L(j) at an initial position (3,), m, with a weak prior. L(j) needs rays before the next update."""
         self._at.points[j] = position
         self._insert(L0 + j, position)
         self.add("landmark", [j], [[point_prior(j, position, self._settings.joint.prior_sigma)]])
@@ -91,7 +91,7 @@ class GrowingGraph(ABC):
         self._touched.update(dict.fromkeys(rays.landmark.tolist(), self._updates + 1))
 
     def add_variable(self, key: int, value: gtsam.Pose3 | Floats) -> None:
-        """Add another variable, a pose or a point (3,), by its key. It needs factors before the next update."""
+        """Add another variable, a pose or a point (3,), by its key. The variable needs factors before the next update."""
         self._outgrown |= key >> LETTER not in {other >> LETTER for other in self._at.others}
         self._at.others[key] = value
         self._insert(key, value)
@@ -128,7 +128,7 @@ class GrowingGraph(ABC):
     def move(self, new_T_old: Floats) -> None:
         """Move the whole estimate by a pose (4, 4). The caller must first remove the absolute poses.
 
-        A prior map does not move. So the pose F of the graph's frame in the prior map changes too.
+        A prior map does not move. So the pose F of the graph's frame in the prior map also changes.
         """
         self.refresh()
         at, weak = self._at, self._settings.joint.prior_sigma

@@ -18,27 +18,29 @@ from objslam.graph.fixed_pose_triangulation import triangulate_landmarks
 from objslam.graph.sliding_window import SlidingWindow
 
 _ITERATIONS = 4
-"""The most iterations of each solve during growth. Few are enough, because each solve starts near its optimum, and the next
-solve goes on from there. A larger number is slower."""
+"""The largest number of iterations of each solve during growth. Few are enough, because each solve starts near its optimum,
+and the next solve goes on from there. A larger number is slower."""
 _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
 """The limits (rad) on the median angle between rays and landmarks at the predicted poses of a step. Below `_HOLDS`, the next
 step is twice as long. Above `_FAILS`, a shorter step is tried. Larger limits take longer steps. On the MRCLAM logs, all
 pairs of limits from (1, 3) to (5, 15) degrees lead to the same map."""
 _GATE, _GATE_SHARE = np.radians(5.0), 3.0
-"""During growth, a ray is an outlier if its angle to its landmark exceeds two limits: `_GATE` (rad), and `_GATE_SHARE` times
-the median angle of the step. Larger values accept more false boxes. The odometry's drift in one step is well below both
-limits."""
+"""Two limits on the angle between a ray and its landmark during growth. They are `_GATE` (rad), and `_GATE_SHARE` times the
+median angle of the step. A ray above both limits is an outlier. Larger values accept more false boxes. The odometry's drift
+in one step is well below both limits."""
 _MORE_RAYS = 1
 """The number of agreeing rays beyond association.min_rays that a new landmark needs. With a larger number, landmarks are
-added later. With a smaller one, false boxes agree by chance too often."""
+added later. With a smaller number, false boxes agree by chance too often."""
 _SHORTEST = 4
-"""The shortest step is joint.grow_step divided by this number, and at least 2. A larger number allows slower growth."""
+"""The number by which joint.grow_step is divided to get the shortest step, which has at least 2 keyframes. A larger number
+allows shorter steps."""
 _AGAIN = 1.05
-"""A landmark that is not yet in the graph is triangulated again when its number of rays has grown by this factor. A larger
-factor is faster, but landmarks are added later. With a factor of 1, the time grows with the square of the rays."""
+"""The factor by which the number of rays of a landmark grows before the landmark is triangulated again. It is for landmarks
+that are not in the graph yet. A larger factor is faster, but landmarks are added later. With a factor of 1, the time grows
+with the square of the number of rays."""
 _RECORDED = 1.02
-"""The trace records a step when the graph has grown by this factor. A larger factor records fewer steps. Each step records
-the whole path, so with a factor of 1 the trace of a long drive would take gigabytes."""
+"""The factor by which the graph grows before the trace records the next step. A larger factor records fewer steps. Each step
+records the whole path, so with a factor of 1 the trace of a long drive would take gigabytes."""
 
 
 def initialize_known(
@@ -52,7 +54,7 @@ def initialize_known(
     window = SlidingWindow(measured, owner, association.count)
     map_T_camera = window.map_T_camera
     first_ray = np.searchsorted(rays.keyframe, np.arange(len(keyframes) + 1))
-    # The rays whose object is not in the graph yet, and the number of these rays at the last triangulation of each object.
+    # The rays whose object is not in the graph yet, and their number at the last triangulation of each object.
     waiting, tried = np.zeros(0, dtype=np.int64), np.zeros(association.count)
     begin, step, recorded = 1, settings.joint.grow_step, 0
     shortest = max(2, step // _SHORTEST)

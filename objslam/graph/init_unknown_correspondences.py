@@ -3,8 +3,8 @@
 As in `init_known_correspondences`, keyframes are added a few at a time, at poses that continue the solved path by odometry,
 and a sliding window is solved. Each ray is assigned to the known landmark whose predicted bearing it fits, within a gate
 that allows for the odometry's drift. Unassigned rays of recent keyframes give new landmarks, because the drift between these
-keyframes is small. Recent landmarks that are the same as old ones close a loop, and only then the whole graph is solved. The
-result is the start of a global association.
+keyframes is small. Recent landmarks that are the same as old landmarks close a loop. After a loop closure, the whole graph
+is solved. The result is the start of a global association.
 """
 
 from collections.abc import Callable
@@ -30,36 +30,37 @@ from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.sliding_window import SlidingWindow
 
 HORIZON = 0.1
-"""A landmark is expected at its position if the heading drifted by less than this (rad, one standard deviation) since the
-landmark, or one beside it, was observed. A larger value recognises landmarks after a longer absence, and confuses neighbours
-more often."""
+"""The drift of the heading (rad, one standard deviation) up to which a landmark is expected at its position. The drift is
+counted since the landmark, or a landmark beside it, was observed. A larger value recognises landmarks after a longer
+absence, and confuses neighbours more often."""
 _STRETCH = 150
 """The number of latest keyframes that are searched for new landmarks. A larger number is slower and includes more drift."""
 _TURNED = np.radians(4.0)
-"""A step ends when the heading has drifted by this (rad, one standard deviation). One correction aligns all poses of a step,
-so the drift within the step blurs its rays. With a larger value, more steps with turns are aligned wrongly. Without a limit,
-a simulated robot lost its way within an hour. With 3 and with 4 degrees, it kept its way."""
+"""The drift of the heading (rad, one standard deviation) at which a step ends. One correction aligns all poses of a step, so
+the drift within the step blurs its rays. With a larger value, more steps with turns are aligned wrongly. Without a limit, a
+simulated robot lost its way within an hour. With 3 and with 4 degrees, the robot kept its way."""
 _PLACE = 0.1
-"""A measured range may err by this (m) in addition to 4 standard deviations of its noise. A larger value accepts more wrong
-ranges."""
+"""The error (m) of a measured range that is accepted in addition to 4 standard deviations of its noise. A larger value
+accepts more wrong ranges."""
 _LEFT, _TURN, _SHIFT = 0.1, np.radians(0.5), 0.02
-"""The uncertainty of the poses in a step after their alignment with the landmarks. It is the share `_LEFT` of the drift's
-covariance, plus the standard deviations `_TURN` (rad) and `_SHIFT` (m). Larger values widen the gate of every ray."""
+"""The uncertainty of the poses of a step after their alignment with the landmarks. Its covariance is the share `_LEFT` of
+the drift's covariance, plus the squares of `_TURN` (rad) and `_SHIFT` (m). Larger values widen the gate of every ray."""
 _MORE_RAYS = 2
 """The number of agreeing rays beyond association.min_rays that a new landmark needs. With more rays, landmarks are added
 later. With fewer rays, more wrong landmarks are added, and each of them disturbs all later poses."""
 _ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
-"""The most iterations of the solve after a step, and of the solve after a loop closure. The solve after a loop closure
-starts farther from its optimum, so it needs more. Larger numbers are slower."""
+"""The largest numbers of iterations of the solve after a step, and of the solve after a loop closure. The solve after a loop
+closure starts farther from its optimum, so it needs more iterations. Larger numbers are slower."""
 _STRAIN = 200.0
-"""A loop closure may raise the cost (a sum of squared deviations) by this amount for each joined landmark. A larger amount
-closes more wrong loops. On MRCLAM, correct loops raised it by up to 110 for each landmark, wrong ones by 240 or more."""
+"""The amount by which a loop closure may raise the cost (a sum of squared deviations) for each joined landmark. A larger
+amount closes more wrong loops. On MRCLAM, correct loops raised the cost by up to 110 for each landmark. Wrong loops raised
+it by 240 or more."""
 _LESSON = 50
-"""The likelihood ratio of appearances is learnt first when twice this number of rays have a landmark. It is learnt again
-each time the number of rays has doubled. A larger number learns later."""
+"""Half the number of rays with a landmark at which the likelihood ratio of appearances is first learnt. The ratio is learnt
+again each time the number of rays with a landmark has doubled. With a larger number, it is learnt later."""
 _AGAIN = 1.05
-"""The covariance of a landmark is computed again when its number of rays has grown by this factor. A larger factor is
-faster, and gates stay wider. With a factor of 1, the time grows with the square of the rays."""
+"""The factor by which the number of rays of a landmark grows before its covariance is computed again. A larger factor is
+faster, and gates stay wider. With a factor of 1, the time grows with the square of the number of rays."""
 _PAIRS = 150
 """The mean number of pairs of landmarks that the search for loops may compare for each keyframe. After a larger search, the
 next one waits for more keyframes. Without a limit, wrong input takes very long, because it gives new landmarks without end.
@@ -161,8 +162,8 @@ class _Exploration:
             self._solve()
 
     def _settle(self, whole: bool) -> None:
-        """Compute the covariances of landmarks that have clearly more rays than before, or of all after a solve of the whole
-        graph."""
+        """Compute the covariances of landmarks that have clearly more rays than before. After a solve of the whole graph,
+        compute all covariances."""
         number = np.bincount(self.owner[self.owner >= 0], minlength=len(self.known))
         due = (number >= _AGAIN * self.counted) | whole
         which = np.flatnonzero(np.append(due, False)[self.owner])
@@ -176,8 +177,8 @@ class _Exploration:
         return None if self.ratio is None else Looks.of(self.rays, self.owner, len(self.known), self.ratio)
 
     def _active(self, now: int) -> Bools:
-        """Return for each landmark (N,) whether the heading drifted by less than `HORIZON` since it was last known around
-        the landmark."""
+        """Return for each landmark (N,) whether the heading drifted by less than `HORIZON` since the heading was last known
+        around the landmark."""
         return np.sqrt(self.known.turned(self.heading, now)) < HORIZON
 
     def _recognise(self, new: Ints, begin: int, end: int) -> None:
@@ -276,10 +277,10 @@ class _Exploration:
         return truncated_cost(self.rays, self.owner, self.known.position, poses, *self.measured.odometry())
 
     def _renumber(self, into: Ints, positions: Floats, map_T_camera: Floats) -> None:
-        """Make the graph again after landmarks were joined or dropped. The rays of landmark j go to landmark into[j] (N,),
-        or to none if it is -1.
+        """Make the graph again after landmarks were joined or dropped. The rays of landmark j go to landmark into[j] (N,).
+        If into[j] is -1, they go to no landmark.
 
-        positions: (M, 3) m, of the new landmarks. map_T_camera: (K, 4, 4).
+        positions: (M, 3) m, the positions of the new landmarks. map_T_camera: (K, 4, 4).
         """
         self.known = self.known.renumbered(into, positions)
         self.owner = np.append(into, -1)[self.owner]
@@ -295,8 +296,8 @@ def _planar_sigmas(covariance: Floats, map_T_camera: Floats) -> Floats:
 
 
 def _drifted(keyframes: Keyframes, since: int, end: int) -> Floats:
-    """Return the covariances (n, 6, 6) that the odometry accumulated after keyframe `since` until each later keyframe before
-    `end`, in its camera's frame."""
+    """Return the covariances (n, 6, 6) that the odometry accumulated from keyframe `since` to each later keyframe before
+    `end`. Each is in the camera frame of the later keyframe."""
     odom_T_base, drift = keyframes.odom_T_base, keyframes.drift
     assert odom_T_base is not None
     assert drift is not None

@@ -2,7 +2,7 @@
 
 If an update raises an exception, Levenberg-Marquardt solves the stored factors from the last good estimate. iSAM2 is then
 rebuilt at this solution. The damping of Levenberg-Marquardt determines the variables without measurements. If iSAM2 still
-raises an exception, landmarks get priors, and if that is not enough, poses too.
+raises an exception, landmarks get priors. If this is not enough, poses also get priors.
 """
 
 from typing import Any
@@ -23,14 +23,14 @@ from objslam.graph.posterior.marginals import HELD, in_camera, in_order
 from objslam.graph.variables import L0, X0, Variables
 
 _AT_ONCE = 100
-"""A graph with at most this number of keyframes is rebuilt in one call. A larger number delays the next image for longer. A
-smaller number spreads more rebuilds over several images."""
+"""The largest number of keyframes of a graph that is rebuilt in one call. A larger number delays the next image for longer.
+A smaller number spreads more rebuilds over several images."""
 _SLICE = 30
-"""The number of keyframes in one slice of a rebuild. A larger number finishes sooner, and delays the next image longer: 100
-take 13 ms of a busy core."""
+"""The number of keyframes in one slice of a rebuild. With a larger number, a rebuild ends sooner, and the next image waits
+longer. A slice of 100 keyframes takes 13 ms of a busy core."""
 _FRESH = 10
-"""A landmark counts as deep in iSAM2's tree after this number of updates that did not involve it. A larger number changes
-the layout of the tree less often, and finds returning landmarks deeper in the tree."""
+"""The number of updates without a landmark after which the landmark counts as deep in iSAM2's tree. A larger number changes
+the layout of the tree less often, and returning landmarks are deeper in the tree."""
 
 
 class IncrementalGraph(GrowingGraph):
@@ -56,8 +56,8 @@ class IncrementalGraph(GrowingGraph):
     def prepare(self, coming: Ints, relinearise: bool = False) -> None:
         """Add the new variables and factors, and prepare the tree for a keyframe that may observe landmarks `coming` (n,).
 
-        An update eliminates all cliques between an observed variable and the root again. So this call moves a variable near
-        to the root if it may be observed and is not there yet. relinearise: whether to relinearise changed variables too.
+        An update eliminates all cliques between an observed variable and the root again. So this call moves the variables
+        that may be observed near to the root. relinearise: whether to also relinearise the variables that changed.
         """
         sunk = any(self._touched.get(j, -_FRESH) <= self._updates - _FRESH for j in coming.tolist())
         self._coming = coming
@@ -94,15 +94,15 @@ class IncrementalGraph(GrowingGraph):
         return np.array([self._at.poses[k] for k in keyframes.tolist()]).reshape(-1, 4, 4)
 
     def variable(self, key: int) -> Any:
-        """Return the value that a variable from `add_variable` had at the last `refresh`. None if there is none."""
+        """Return the value that a variable from `add_variable` had at the last `refresh`. None for an unknown key."""
         return self._at.others.get(key)
 
     def pose_covariance(self, k: int) -> Floats:
-        """Return the covariance (6, 6) of X(k) in the camera frame, rotation first. It is NaN if iSAM2 cannot give it."""
+        """Return the covariance (6, 6) of X(k) in the camera frame, rotation first. NaN if iSAM2 cannot compute it."""
         return self._covariance(X0 + k, 6)
 
     def point_covariance(self, j: int) -> Floats:
-        """Return the covariance (3, 3) of L(j), m^2. It is NaN if iSAM2 cannot give it."""
+        """Return the covariance (3, 3), m^2, of L(j). NaN if iSAM2 cannot compute it."""
         return self._covariance(L0 + j, 3)
 
     def seen_covariance(self, j: int, k: int) -> Floats:
@@ -138,15 +138,15 @@ class IncrementalGraph(GrowingGraph):
     def solve(self, iterations: int, tolerance: float = 1e-5) -> None:
         """Optimise all variables by Levenberg-Marquardt from the current estimate, and rebuild iSAM2 there.
 
-        It stops after `iterations`, or when the cost falls by a smaller share than `tolerance`. SolveError if the cost is
-        not finite, or if no factor determines some variable. After a SolveError the graph is unchanged.
+        The solve ends after `iterations`, or when the cost falls by a smaller share than `tolerance`. SolveError if the cost
+        is not finite, or if no factor determines some variable. After a SolveError the graph is unchanged.
         """
         self.refresh()
         self._at.read(levenberg_marquardt(self._store.graph(), self._at.values(), iterations, tolerance).values)
         self.rebuild()
 
     def iterate(self) -> float:
-        """Optimise all variables by one iteration of Levenberg-Marquardt, and return by which share the cost fell.
+        """Optimise all variables by one iteration of Levenberg-Marquardt. Return the share by which the cost fell.
 
         iSAM2 does not change until a `rebuild`, which must follow before the next update. SolveError as in `solve`.
         """
@@ -164,7 +164,7 @@ class IncrementalGraph(GrowingGraph):
             self._rescue()
 
     def rebuild_in_slices(self, order: Ints) -> None:
-        """Start a rebuild. Each call of `continue_rebuild` runs one slice of it. Until its end, the old graph stays in use.
+        """Start a rebuild. Each call of `continue_rebuild` runs one slice. Until the last slice, the old graph stays in use.
 
         A graph of at most `_AT_ONCE` keyframes is rebuilt at once. A graph whose rebuild has not ended is also rebuilt at
         once, because frequent changes could postpone the end for ever. order: (K,) all keyframes. The keyframe at the start
@@ -185,7 +185,7 @@ class IncrementalGraph(GrowingGraph):
         return self._unfinished
 
     def continue_rebuild(self) -> None:
-        """Run the next slice of the rebuild, if there is one. The slice after the last one frees the old tree."""
+        """Run the next slice of the rebuild, if one has begun. The call after the last slice frees the old tree."""
         self._replaced = None
         if self._rebuild is None:
             return
@@ -198,7 +198,7 @@ class IncrementalGraph(GrowingGraph):
         except RuntimeError:  # A full rebuild can handle this.
             self.rebuild()
             return
-        self._clear()  # The new iSAM2 contains these factors and variables too.
+        self._clear()  # The new iSAM2 also contains these factors and variables.
         self._replaced = self._isam, self._rebuild
         self._isam, self._stale = self._rebuild.isam, True
         self._rebuild, self._unfinished, self._prepared = None, False, False

@@ -10,8 +10,8 @@ from objslam.graph.factor_store import FactorStore, Stored
 from objslam.graph.variables import LETTER, X0, Variables
 
 _RELINEARISE = (0.02, 0.05)
-"""The factors of a variable are linearised again if the variable changes by more than this (rad, m). Larger values are
-faster and less exact. A change below these values has no noticeable effect on a bearing."""
+"""The changes (rad, m) of a variable above which its factors are linearised again. Larger values are faster and less exact.
+A change below these values has no noticeable effect on a bearing."""
 _NEVER = 1_000_000
 """The number of updates between two automatic relinearisations, so large that none happens. The caller asks for a
 relinearisation when it has time. A smaller number relinearises without a request."""
@@ -35,11 +35,12 @@ def new_isam(others: Mapping[int, gtsam.Pose3 | Floats]) -> gtsam.ISAM2:
 
 
 class IncrementalRebuild:
-    """A new iSAM2. It gets the stored factors keyframe by keyframe, and at the end what the old graph got in the meantime.
+    """The construction of a new iSAM2. It gets the stored factors keyframe by keyframe. At the end, it gets what the old
+    graph got in the meantime.
 
-    order: the keyframes as they are added. The keyframe at the start of a motion comes before the one at its end. variables:
-    the linearisation points. isam: the new iSAM2 so far. new: the keys of the variables that came after the start of the
-    rebuild. later: the factors that came after the start.
+    order: the keyframes in the order in which they are added. The keyframe at the start of a motion comes before the one at
+    its end. variables: the linearisation points. isam: the new iSAM2 so far. new: the keys of the variables that came after
+    the start of the rebuild. later: the factors that came after the start.
     """
 
     def __init__(self, store: FactorStore, order: list[int], variables: Variables) -> None:
@@ -84,7 +85,8 @@ class IncrementalRebuild:
         self.isam.calculateEstimate()  # It raises here if the graph is indeterminate.
 
     def _sort(self) -> None:
-        """Sort the factors. The first step does it, and not the start, which comes after other work on the same image."""
+        """Sort the factors by the step that adds them. The first step calls this method. The start of a rebuild does not,
+        because it comes after other work on the same image."""
         if self._sorted:
             return
         self._sorted = True

@@ -25,33 +25,33 @@ from objslam.graph.sliding_window import SlidingWindow
 from objslam.graph.variables import X0
 
 _EPOCHS = 8
-"""A loop is searched in this number of the latest epochs (`_EPOCH`). A larger number is slower and closes longer loops."""
+"""The number of latest epochs (`_EPOCH`) in which a loop is searched. A larger number is slower and closes longer loops."""
 _SLIPS = (1.0, 3.0, 10.0)
-"""The search for a loop is done once with each of these factors on the standard deviations of the drift. Wheels can slip
-more than a Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
+"""Factors on the standard deviations of the drift. A loop is searched once with each factor, because wheels can slip more
+than a Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
 _BESIDE = 0.03
-"""If the heading is known around one landmark, it has this standard deviation (rad) around another landmark that some frame
-showed beside the first. Landmarks about 1 m apart err by 2 or 3 cm. With a smaller value, landmarks are recognised after
-longer ways through the map, though parts of the map may be bent."""
+"""The standard deviation (rad) that the heading gains from one landmark to another landmark that some frame showed beside
+the first. Landmarks about 1 m apart err by 2 or 3 cm. With a smaller value, landmarks are recognised after longer ways
+through the map, though parts of the map may be bent."""
 _STEPS = 10
-"""The most landmarks on a way through the map from a known landmark to another. More than ten add a larger variance than an
-exploration accepts."""
+"""The largest number of landmarks on a way through the map from a known landmark to another. More than ten landmarks add a
+larger variance than an exploration accepts."""
 _MORE = 1.5
-"""Landmarks are compared again when the recent landmark of a pair has this multiple of the rays that it had before. A larger
-number is faster, and finds loops later. With 1, two landmarks that never match would be compared at each step."""
+"""The factor by which the rays of the recent landmark of a pair grow before the pair is compared again. A larger factor is
+faster, and finds loops later. With 1, two landmarks that never match would be compared at each step."""
 _EPOCH = 40
-"""An epoch is this number of consecutive keyframes. The drift since an epoch is computed from only one of its keyframes, so
-a larger number is faster and less exact. A landmark counts as new for this number of keyframes."""
+"""The number of consecutive keyframes in an epoch. The drift since an epoch is computed from only one of its keyframes, so a
+larger number is faster and less exact. A landmark counts as new for this number of keyframes."""
 
 _BENDS = ((0.5, 0.5, 0.1), (2.0, 2.0, 0.5))
-"""Standard deviations of the bends of a solved path that missed a loop: in x, y (m) and yaw (rad). They are chosen, not
-measured. The first is a slip, the second a path that was bent to confused landmarks (25 degrees and 2 m in a simulated
-drive). Larger values propose more loops, and a solve judges each."""
+"""Standard deviations, in x, y (m) and yaw (rad), of the bends of a solved path that missed a loop. They are chosen, not
+measured. The first bend is a slip, the second a path that was bent to confused landmarks (25 degrees and 2 m in a simulated
+drive). Larger values propose more loops, and a solve judges each loop."""
 _CUTS = 20
-"""The most keyframes that divide a path into a part before a missed loop and a part after it. Most keyframes near a loop
+"""The largest number of keyframes that divide a path into parts before and after a missed loop. Most keyframes near a loop
 show it, so few are enough. A larger number takes longer."""
 SEARCHES = _CUTS * len(_BENDS)
-"""The most searches for a missed loop in a solved path. Each of them may find a loop by chance."""
+"""The largest number of searches for a missed loop in a solved path. Each search may find a loop by chance."""
 
 
 @dataclass
@@ -136,7 +136,7 @@ class Landmarks:
         """Return the variance (N,), rad^2, of the heading at keyframe `now` in the part of the map around each landmark.
 
         The heading drifts since the last observation of a landmark. If a frame showed another landmark beside it, the other
-        one shows where it is. So if the other one was observed later, the heading drifts only since then.
+        landmark fixes its place. So if the other landmark was observed later, the heading drifts only since that time.
 
         heading: (K,) the variance of the odometry's heading.
         """
@@ -155,9 +155,9 @@ class Landmarks:
 class Closure:
     """A loop: recent landmarks that are the same as old landmarks.
 
-    correction: (4, 4) moves the later poses in map to where they should be. now: (P,) the recent landmarks. before: (P,) for
-    each of these the old landmark. evidence: the log odds of the loop. repeated: the log odds that the recent landmarks are
-    others that a frame shows beside them. They are not, so places like this one repeat (`repetition`).
+    correction: (4, 4) moves the later poses in map to where they should be. now: (P,) the recent landmarks. before: (P,) the
+    old landmark of each. evidence: the log odds of the loop. repeated: the log odds of a match of the recent landmarks with
+    others that a frame shows beside them. Such a match is false, and shows that such places repeat (`repetition`).
     """
 
     correction: Floats
@@ -184,7 +184,7 @@ def find_closure(
     landmark of a pair has many more rays than at the last search (`_MORE`). A pair counts once for each tried drift.
 
     Where things repeat, as the doors of a corridor do, recent landmarks also match others that some frame shows beside them.
-    They are certainly not the same. So a loop needs its lead over the best of these matches too (`repetition`).
+    Such matches are certainly false. So a loop also needs its lead over the best false match (`repetition`).
 
     window: the solved graph. now: the newest keyframe. looks: what the landmarks look like, None if this is not known.
     """
@@ -230,13 +230,13 @@ def find_closure(
 def find_missed_closures(landmarks: Landmarks, middle: Floats, map_T_camera: Floats, sure: float = np.inf) -> list[Closure]:
     """Return loops that a whole solved path may have missed, with the most evidence first.
 
-    A search during initialisation allows for the drift that the odometry says. Landmarks may be confused after an unlikely
-    slip, which bends the path by more than that. So this search allows for large bends (`_BENDS`) at keyframes where a
+    A search during initialisation allows for the drift by the noise of the odometry. Landmarks may be confused after an
+    unlikely slip, which bends the path by more. So this search allows for large bends (`_BENDS`) at keyframes where a
     landmark is first seen. The landmarks that are seen mostly after this keyframe are matched with landmarks seen mostly
     before it. The loops are proposals, and a solve must judge them.
 
     middle: (N,) the median keyframe of the rays of each landmark, NaN for landmarks that do not count. map_T_camera: (K, 4,
-    4) the solved poses. sure: closures with at least this evidence are compared with repetitions. The others have 0 there.
+    4) the solved poses. sure: only closures with at least this evidence get `repeated`. For the others, `repeated` is 0.
     """
     counts = np.flatnonzero(np.isfinite(middle))
     if len(counts) < 2 * MIN_LANDMARKS:
@@ -281,8 +281,8 @@ def closed_path(closure: Closure, landmarks: Landmarks, map_T_camera: Floats, dr
 
 
 def heading_variance(drift: Floats) -> Floats:
-    """Return the variance (K,), rad^2, of the heading at each keyframe, by the drift (K, 6, 6) of the odometry. It never
-    falls, so its increase shows how far the heading drifted between two keyframes."""
+    """Return the variance (K,), rad^2, of the heading at each keyframe, from the drift (K, 6, 6) of the odometry. The
+    variance never falls. Its increase between two keyframes shows how far the heading drifted."""
     return np.maximum.accumulate(np.linalg.eigvalsh(drift[:, :3, :3])[:, -1])
 
 

@@ -1,9 +1,9 @@
 """Other starts of a joint solve from odometry (multi-start; Martí 2003), and the one that explains the rays best.
 
-A landmark enters the growing graph when its rays have enough parallax. Then its position follows from poses by odometry
-alone. If these err, the landmark may be metres off. The path bends to its rays, and the solve ends in a local minimum, which
-each later step refines. A graph that grows with less parallax, or with more, adds its landmarks at other times, and seldom
-ends in the same wrong minimum.
+A landmark enters the growing graph when its rays have enough parallax. At that time, its position follows from poses by
+odometry alone. If these poses err, the landmark may be metres off. The path bends to its rays, and the solve ends in a local
+minimum, which each later step refines. A graph that grows with less parallax, or with more parallax, adds its landmarks at
+other times. It seldom ends in the same wrong minimum.
 """
 
 from collections.abc import Callable
@@ -21,35 +21,35 @@ from objslam.graph.outlier_rejection import JointSolution
 
 _PARALLAX = (0.5, 2.0)
 """The multiples of joint.min_parallax_deg with which other graphs grow. In three of 48 random parts of real drives, seen by
-bearings only, the first graph led to landmarks that were 1 to 2 m off. All three were right with half of the parallax, and
-two with twice the parallax. Two of the three graphs may end in one wrong minimum, so both values count. More values take
-longer."""
+bearings only, the first graph led to landmarks that were 1 to 2 m off. All three parts were right with half of the parallax,
+and two with twice the parallax. Two of the three graphs may end in one wrong minimum, so both values are used. More values
+take longer."""
 _FEW_RAYS = 1500
-"""In logs with more rays, no further start is tried after one that ends in a known minimum. In some random parts of real
-drives, the second start ended in the minimum of the first. With fewer rays than this, the third start then had a better
-minimum in 7 of 59 parts, and with more rays in 2 of 71. A larger number makes logs of some minutes slower."""
+"""The number of rays above which no further start is tried after a start that ends in a known minimum. In some random parts
+of real drives, the second start ended in the minimum of the first start. The third start then had a better minimum in 7 of
+59 parts with fewer rays, and in 2 of 71 parts with more rays. A larger number makes logs of some minutes slower."""
 _SAME = 0.1
-"""Two solutions are in one minimum if no landmark differs by more than this share of the size of the map. In wrong minima of
-real drives, at least one landmark differs by a third of the map's size or more. With a larger share, more solutions count as
-equal, so fewer are compared."""
+"""The largest difference of a landmark between two solutions in one minimum, as a share of the size of the map. In wrong
+minima of real drives, at least one landmark differs by a third of the map's size or more. With a larger share, more
+solutions count as equal, so fewer solutions are compared."""
 _MOST_RAYS = 6000
-"""Logs with more rays begin at one graph only. They are drives of more than a quarter of an hour, which see landmarks again
-and again, and no wrong minimum was found in them. A larger number makes long logs slower."""
+"""The number of rays above which a log begins at one graph only. Such logs are drives of more than a quarter of an hour,
+which see landmarks again and again. No wrong minimum was found in them. A larger number makes long logs slower."""
 _GROWN = 0.05
-"""A graph that has grown is in a known minimum if no landmark differs by more than this share of the size of the map. Then
-no solve follows. In 170 random parts of real drives, 85 graphs were in a known minimum, and no solve from them ended
-elsewhere. A larger share saves more solves."""
+"""The largest difference of a landmark between a grown graph and a known minimum, as a share of the size of the map. A graph
+in a known minimum is not solved. In 170 random parts of real drives, 85 graphs were in a known minimum, and no solve from
+them ended elsewhere. A larger share saves more solves."""
 _CLEARLY = 3.0
-"""Another start is better than the first one if its misfit, which is twice a logarithm of odds, is smaller by this number. A
-larger value changes the start more rarely."""
+"""The least decrease of the misfit for which another start replaces the first start. The misfit is twice a logarithm of
+odds. A larger value changes the start more rarely."""
 
 
 @dataclass(frozen=True)
 class MultiStart:
-    """How solves begin and are compared.
+    """The search for the best start of a joint solve.
 
-    solve: returns the solution from poses (K, 4, 4) and positions (N, 3), with a trace. misfit: returns how badly a solution
-    explains the rays, after its shared errors were estimated.
+    solve: returns the solution that starts from poses (K, 4, 4) and positions (N, 3), and records it in a trace. misfit:
+    returns how badly a solution explains the rays, after its shared errors were estimated.
     """
 
     measured: Measurements
@@ -60,9 +60,9 @@ class MultiStart:
     def best(self, found: JointSolution, trace: Trace | None = None) -> JointSolution:
         """Return the solution with the least misfit: `found`, or one that begins at another growing graph.
 
-        Ranges determine a position at once. So if at least half of the objects have one, or if there are fiducials, the
-        first solution is returned. It is also returned for a log with many rays (`_MOST_RAYS`). In a log with more than few
-        rays (`_FEW_RAYS`), no further start is tried after one that ends in a known minimum.
+        A range determines a position at once. So if at least half of the objects have a range, or if there are fiducials,
+        the first solution is returned. It is also returned for a log with more than `_MOST_RAYS` rays. In a log with more
+        than `_FEW_RAYS` rays, no further start is tried after a start that ends in a known minimum.
         """
         rays, object_ = self.measured.rays, self.association.object
         ranged = np.unique(object_[np.isfinite(rays.range) & (object_ >= 0)])
@@ -95,8 +95,8 @@ class MultiStart:
 
 
 def _among(solutions: list[JointSolution], positions: Floats, share: float) -> bool:
-    """Return whether one of the solutions has the same landmarks as `positions` (N, 3), in places that differ by at most a
-    share of its size."""
+    """Return whether one of the solutions has the same landmarks as `positions` (N, 3), at places that differ by at most
+    `share` times the size of its map."""
     return any(_in_one_minimum(one.positions, positions, share) for one in solutions)
 
 

@@ -16,8 +16,8 @@ from objslam.errors import SolveError
 from objslam.graph.variables import read_poses, with_points
 
 STILL = 5e-3
-"""A joint solve ends if an iteration decreases the cost by less than this. The cost is half the sum of squared residuals in
-standard deviations. A step that decreases it by d moves no variable by more than sqrt(2 d) standard deviations of this
+"""The decrease of the cost below which an iteration ends a joint solve. The cost is half the sum of squared residuals in
+standard deviations. A step that decreases the cost by d moves no variable by more than sqrt(2 d) standard deviations of this
 variable (Cauchy-Schwarz with the information matrix). Here, sqrt(2 d) is 0.1. A larger value ends a solve sooner."""
 
 OnIteration = Callable[[float, gtsam.Values], None]
@@ -28,7 +28,8 @@ OnIteration = Callable[[float, gtsam.Values], None]
 class Optimum:
     """The result of an optimisation. SolveError if its cost is not finite.
 
-    iterations: of Levenberg-Marquardt, 0 for GNC. weights: (F,) the weights of the factors from GNC, else None.
+    iterations: the number of iterations of Levenberg-Marquardt, 0 for GNC. weights: (F,) the weights of the factors from
+    GNC, None without GNC.
     """
 
     values: gtsam.Values
@@ -93,8 +94,8 @@ def levenberg_marquardt(
 ) -> Optimum:
     """Minimise by Levenberg-Marquardt. SolveError if the linear system is indeterminate, or if the cost is not finite.
 
-    relative_tolerance: the solve ends if an iteration decreases the cost by less than this share. still: it also ends if an
-    iteration decreases the cost by less than this, for example `STILL`.
+    relative_tolerance: the solve ends if an iteration decreases the cost by less than this share. still: the solve also ends
+    if an iteration decreases the cost by less than this amount, for example `STILL`.
     """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(max_iterations)
@@ -145,7 +146,7 @@ def graduated(
 
 
 def indeterminate(error: RuntimeError) -> SolveError:
-    """Return a SolveError that explains an exception of GTSAM. It names the undetermined variable if GTSAM does."""
+    """Return a SolveError that explains an exception of GTSAM. The error names the undetermined variable if GTSAM does."""
     reason = " ".join(str(error).strip().partition("\n\n")[0].split()) or type(error).__name__
     return SolveError(
         f"the factor graph has no single solution: {reason.rstrip('.')}",

@@ -21,17 +21,17 @@ from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.variables import read_poses, with_points
 
 _BESIDE, _MOST = 5, 0.6
-"""The stretch of a ray goes from `_BESIDE` rays before it to `_BESIDE` rays after it. A rejected ray gets a second chance if
-at least the share `_MOST` of its stretch is rejected. Perhaps the poses are wrong there. A few false boxes in a row get no
-second chance. Larger values restore fewer rays."""
+"""When a rejected ray gets a second chance. The stretch of a ray goes from `_BESIDE` rays before it to `_BESIDE` rays after
+it. A rejected ray gets a second chance if at least the share `_MOST` of its stretch is rejected, because the poses of the
+stretch may be wrong. A few false boxes in a row get no second chance. Larger values restore fewer rays."""
 ROUNDS = 4
-"""The most rounds of solve and test. More rounds are slower, and late rounds change few rays."""
+"""The largest number of rounds of solve and test. More rounds are slower, and late rounds change few rays."""
 _COARSE = 1e-4
-"""A solve before a test of inliers ends when its cost decreases by less than this share. Robust losses converge slowly, and
-a more exact solution hardly changes an inlier. A larger value is faster."""
+"""The decrease of the cost, as a share of the cost, below which an iteration ends a solve before a test of inliers. Robust
+losses converge slowly, and a more exact solution hardly changes an inlier. A larger value is faster."""
 _SURE = 0.95
-"""An object is triangulated again if less than this share of its rays are inliers. A larger share is slower, and corrects
-more objects at wrong positions."""
+"""The share of inliers among the rays of an object below which the object is triangulated again. A larger share is slower,
+and corrects more objects at wrong positions."""
 
 
 Near = tuple[Ints, Equations]
@@ -71,8 +71,8 @@ def reject_outliers(
     solve, or all False. back: (R,) rays that are inliers in the first solve, whatever the test says. tolerance: the last
     solve ends if the cost decreases by less than this share. Earlier solves end at `_COARSE`, if that is larger. Inliers of
     an earlier solve seldom change. So with them, the first solve already ends at `tolerance`. near: the normal equations of
-    a solve on arrays that ended near the start. Solves on arrays go on from them. close: whether the start is near the
-    optimum, because it solves nearly the same measurements. Then not even the first solve needs GTSAM.
+    a solve on arrays that ended near the start. Solves on arrays use them first. close: whether the start is near the
+    optimum, because it solves nearly the same measurements. If it is near, even the first solve is on arrays.
     """
     optimum, cost_before, iterations = None, np.nan, 0
     limit = tolerance if used.any() else max(tolerance, _COARSE)
@@ -118,8 +118,9 @@ class _Solver:
     ) -> tuple[Floats, Floats, Optimum]:
         """Return poses (K, 4, 4), positions (N, 3) and the optimum for the inliers `used` (R,).
 
-        An optimum of arrays has no values. If a solve on arrays ends before an optimum, GTSAM goes on from there, and names
-        a variable that is not determined. last: the optimum of the same inliers, where GTSAM goes on.
+        The optimum of a solve on arrays has no values of GTSAM. If a solve on arrays ends before an optimum, GTSAM goes on
+        from there, and names a variable that is not determined. last: the optimum of the same inliers, from which GTSAM goes
+        on.
         """
         steps, loss, settings = 0, self.measured.settings.joint.loss, self.measured.settings
         if self.close and loss == "huber" and self.measured.tags is None:
@@ -165,12 +166,12 @@ def known_landmarks(positions: Floats) -> Ints:
 
 
 def order_near(near: Near | None, landmarks: Ints) -> Ints | None:
-    """Return the order of elimination (D,) of a solve that had these landmarks (m,). None if it had others, or no order."""
+    """Return the order of elimination (D,) of a solve that had these landmarks (m,). None for other landmarks or a chain."""
     return near[1].order if near is not None and np.array_equal(near[0], landmarks) else None
 
 
 def rejected_stretches(rays: Rays, association: Association, found: JointSolution) -> Bools:
-    """Return a mask (R,) of the rejected rays whose neighbours in time are mostly rejected too."""
+    """Return a mask (R,) of the rejected rays whose neighbours in time are also mostly rejected."""
     order = np.flatnonzero(np.isin(association.object, np.flatnonzero(np.isfinite(found.positions[:, 0]))))
     order = order[np.argsort(rays.keyframe[order], kind="stable")]
     rejected, window = ~found.used[order], np.ones(2 * _BESIDE + 1)

@@ -18,12 +18,12 @@ _WINDOW = 60
 """The number of earlier keyframes that a step solves again. A larger number is slower and corrects older poses. On the
 MRCLAM robots, windows of 30, 60 and 120 keyframes lead to the same maps."""
 _GROWTH = 2.0
-"""The whole graph is solved when it has grown by this factor since its last whole solve. A larger factor is faster. A
-smaller factor corrects sooner what a window ignores: the errors of its priors are correlated, and a loop bends old poses."""
+"""The factor by which the graph grows between two solves of the whole graph. A larger factor is faster. A window ignores
+that the errors of its priors are correlated, and that a loop bends old poses. A smaller factor corrects this sooner."""
 _AT_CAMERA = 1e-3
-"""A landmark within this distance (m) of a camera is wrong and leaves the graph. So near to a camera, the information of a
-bearing is so large that the linear system becomes singular. The solver moved landmarks there on real drives whose clocks
-were 0.2 s apart. A larger distance also removes real landmarks."""
+"""The distance (m) from a camera below which a landmark is wrong and leaves the graph. Below this distance, the information
+of a bearing is so large that the linear system becomes singular. The solver moved landmarks to a camera on real drives whose
+clocks were 0.2 s apart. A larger distance also removes real landmarks."""
 
 
 class SlidingWindow:
@@ -34,7 +34,7 @@ class SlidingWindow:
     """
 
     def __init__(self, measured: Measurements, owner: Ints, landmarks: int) -> None:
-        """Start with the first keyframe. owner: (R,) the landmark of each ray. The caller may change it for later rays."""
+        """Start with the first keyframe. owner: (R,) the landmark of each ray. The caller may change its later entries."""
         self.map_T_camera = measured.keyframes.map_T_camera.copy()
         self.positions = np.full((landmarks, 3), np.nan)
         self._measured, self._owner = measured, owner
@@ -47,10 +47,10 @@ class SlidingWindow:
         self.extend(1, nothing, nothing, np.zeros((0, 3, 3)))
 
     def extend(self, end: int, rays: Ints, born: Ints, covariance: Floats) -> None:
-        """Add the keyframes before `end`, rays (n,) and landmarks `born` (m,). Their poses and positions must be set before.
+        """Add the keyframes before `end`, rays (n,) and landmarks `born` (m,). The poses and positions must be set already.
 
-        covariance: (m, 3, 3) m^2 of the landmarks. If a landmark has rays from before the window, its covariance here is its
-        prior.
+        covariance: (m, 3, 3) m^2 of the landmarks. If a landmark has rays from before the window, this covariance becomes
+        its prior.
         """
         keyframe = self._measured.rays.keyframe
         for factor in self._measured.factors(self._owner, rays, born, self.positions, begin=self.end, end=end):
@@ -86,7 +86,7 @@ class SlidingWindow:
         return graph, self._values
 
     def solve(self, iterations: int, whole: bool = False) -> Optimum:
-        """Solve the window by at most some iterations. Then move the window on.
+        """Solve the window by at most `iterations` iterations. Then move the window on.
 
         The whole graph is solved if the caller asks for it, or if the graph has grown enough or is complete.
 

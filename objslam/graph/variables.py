@@ -3,7 +3,7 @@
 In X(k), k is a keyframe. If images share a pose, k is a multiframe, and X(k) the pose of its first camera. Y(t) is the pose
 of fiducial t. If its size is not known, Z(t) (m) is the first value of half its diagonal minus the present value.
 
-A symbol is a letter and a number. A graph may hold other variables too, so variables are found by symbol, never by type.
+A symbol is a letter and a number. A graph may also hold other variables, so variables are found by symbol, never by type.
 """
 
 from dataclasses import dataclass, field

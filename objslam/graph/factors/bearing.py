@@ -13,8 +13,9 @@ from objslam.graph.factors.noise import Noise
 from objslam.graph.variables import L0, X0
 
 STANDOFF = 1e7
-"""The distance (m) of a virtual camera behind the origin of its ray. A larger value leaves less perspective, but is rounded
-more coarsely. The relative error by perspective is the range divided by this distance. The rounding error is 1 nm."""
+"""The distance (m) of a virtual camera behind the origin of its ray. A larger value has a smaller error by perspective, and
+a larger rounding error. The relative error by perspective is the range divided by this distance. The rounding error at this
+distance is 1 nm."""
 L1_RADIANS = 1e-4
 """The angle (rad) below which the loss `l1` on bearings is quadratic, so that it has a derivative at 0. A larger angle is
 smoother and less like a norm. This angle is about a twentieth of a pixel, far below the noise of a box."""
@@ -34,7 +35,7 @@ def bearings(
     directions: (R, 3) in the frame of X(keyframe). offset: (R, 3) m, the origin of each ray in this frame. None means the
     origin of the frame. GTSAM has no bearing factor with an offset. So a ray with an offset gets an equidistant camera of
     focal length 1 px that looks along the ray. The distance of the landmark from the centre of its image is the angle.
-    Behind the camera the error is larger and constant.
+    For a landmark behind the camera, the residual is larger and constant.
     """
     unit, away = gtsam.Unit3, np.zeros(len(directions), dtype=bool) if offset is None else (offset != 0).any(axis=1)
     cameras = iter(() if offset is None else _poses(offset[away], directions[away]))
@@ -82,12 +83,13 @@ def bearings_fixed(
 ) -> list[gtsam.NonlinearFactor]:
     """Return a factor for each ray on the angle (rad) between the ray and L(landmark), for fixed poses.
 
-    The angle is seen from a point behind the origin of the ray. Behind this point, the residual is larger and constant.
+    The angle is seen from a point behind the origin of the ray. For a landmark behind this point, the residual is larger and
+    constant.
 
     Args:
         origins, directions: (R, 3) m, (R, 3) in map.
-        standoff: (R,) m, the distance of the point from the origin. 0 gives a bearing, a large distance gives Eq. 1 divided
-            by this distance.
+        standoff: (R,) m, the distance of the point from the origin. With 0, the residual is the bearing. With a large
+            standoff, the residual is the distance of Eq. 1 divided by the standoff.
     """
     make, camera = gtsam.TriangulationFactorCal3Fisheye, gtsam.PinholeCameraCal3Fisheye
     n = directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -98,9 +100,9 @@ def bearings_fixed(
 
 
 def virtual_cameras(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
-    """Return a camera for each ray, far behind its origin (R, 3) m, looking along its direction (R, 3).
+    """Return a camera pose for each ray, `STANDOFF` behind its origin (R, 3) m. The camera looks along its direction (R, 3).
 
-    The coordinates of a point in the image are the offset (m) of the point across the ray.
+    The image coordinates of a point are the offset (m) of the point across the ray.
     """
     n = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     return _poses(origins - STANDOFF * n, n)
@@ -120,8 +122,8 @@ def tangent_basis(directions: Floats) -> Floats:
 def residual_axes(directions: Floats, to_landmark: Floats, offset: Floats | None, metric: bool) -> Floats:
     """Return the axes (R, 3, 2) along which the factors of rays measure their residuals, for `ray_residuals`.
 
-    In GTSAM's bearing factor (no offset, not metric), they are perpendicular to the line from the origin to the landmark. In
-    all other factors, they are perpendicular to the ray. directions, to_landmark, offset: (R, 3).
+    In GTSAM's bearing factor (no offset, not metric), the axes are perpendicular to the line from the origin to the
+    landmark. In all other factors, the axes are perpendicular to the ray. directions, to_landmark, offset: (R, 3).
     """
     if metric:
         return tangent_basis(directions)

@@ -26,7 +26,10 @@ def frame_prior(map_T_drive: Floats) -> gtsam.NonlinearFactor:
 
 
 def own_errors(objects: Ints, covariance: Floats) -> list[gtsam.NonlinearFactor]:
-    """Return the factors F * L(j) = P(j) of objects (n,). covariance: (n, 3, 3) m^2 of the difference, in map."""
+    """Return one factor for each of the objects (n,), which says that F * L(j) = P(j).
+
+    covariance: (n, 3, 3) m^2, the covariance of the difference of the two sides, in map.
+    """
     make = gtsam.noiseModel.Gaussian.Covariance
     return [
         gtsam.ReferenceFrameFactorPoint3Pose3(L0 + j, F0, P0 + j, make(c))

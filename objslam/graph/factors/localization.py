@@ -1,10 +1,10 @@
 """Factors for a localisation, which measures the absolute pose of a keyframe.
 
-The error of a pose may be new in each pose, or last for seconds, or both. A lasting error is a first-order Gauss-Markov
-process (Jazwinski 1970, 4.5): between two poses it keeps the share r = exp(-t / T), and r^2 of its variance. The information
-of such a chain is a sum of terms on single errors and on differences of consecutive errors. So a localisation whose errors
-last gives weak absolute poses, and precise motions from pose to pose. They become priors and between-factors, without
-further variables.
+The error of a pose may be new in each pose, or last for seconds, or have both parts. A lasting error is a first-order
+Gauss-Markov process (Jazwinski 1970, 4.5). After the time t, the share r = exp(-t / T) of the error is left, and r^2 of its
+variance. The information of such a chain is a sum of terms on single errors and on differences of consecutive errors. So a
+localisation with lasting errors gives weak absolute poses, and precise motions from pose to pose. The absolute poses become
+priors, and the motions become between-factors. No further variables are needed.
 """
 
 from dataclasses import dataclass, replace
@@ -24,17 +24,17 @@ from objslam.graph.variables import X0
 
 _UNTOLD = 10.0
 """The standard deviation (rad, m) of the parts of a motion that a localisation does not measure, such as the change of
-height. A larger value constrains less, and costs digits."""
+height. A larger value constrains these parts less, and makes the solve less exact."""
 _CONTINUED = 1e3
 """The standard deviation (rad, m) of an absolute pose that no localisation measured. It must be so large that thousands of
-such poses together still tell nothing. A larger value costs digits."""
+such poses together still have almost no information. A larger value makes the solve less exact."""
 _LONGEST = 0.9999
-"""The largest share of a lasting error that stays from one pose to the next. A larger share ties two poses of nearly the
-same time more closely, and costs digits."""
+"""The largest share of a lasting error that is left at the next pose. A larger share ties two poses of nearly the same time
+more closely, and makes the solve less exact."""
 
 
 Parts = Floats | float
-"""Standard deviations: one for all, or one for each."""
+"""Standard deviations of poses or motions: one number for all, or an array with one number for each."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class LocalizedMotions:
     covariance: Floats
 
     def joined(self, other: Self) -> Self:
-        """Return these motions and other ones."""
+        """Return these motions, followed by other motions."""
         return replace(self, **{name: np.concatenate([mine, getattr(other, name)]) for name, mine in vars(self).items()})
 
     def factors(self) -> list[gtsam.NonlinearFactor]:
@@ -68,8 +68,8 @@ def localizations(
     """Return priors on the poses of the keyframes, which are X(first), X(first + 1) and so on.
 
     The priors have Huber's loss, because a localisation may jump. If one measurement gives the poses of several keyframes,
-    only the nearest one has its information (`localized`). Without odometry between them, each has an equal part. on_plane:
-    whether the path is planar. If it is None, the poses decide.
+    only the nearest keyframe has the information (`localized`). If `localized_at` is None, all keyframes have equal parts.
+    on_plane: whether the path is planar. If it is None, the poses decide.
     """
     covariance = localization_covariance(keyframes, settings, on_plane)
     return [
@@ -103,8 +103,8 @@ def localization_covariance(keyframes: Keyframes, settings: Settings, on_plane: 
 def localized_motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = None) -> LocalizedMotions | None:
     """Return the motions that a localisation measures because its errors last. None if its errors are new in each pose.
 
-    A motion is known in the frame of the robot. An error of the robot's heading turns the motion to a side. This error may
-    last too, so here the heading has the noise of an absolute heading.
+    A motion is known in the frame of the robot. An error of the robot's heading turns the motion to a side. Because this
+    error may last, it has the noise of an absolute heading here.
     """
     if not keyframes.localized_every or len(keyframes) < 2:
         return None
@@ -129,9 +129,9 @@ def localized_motions(keyframes: Keyframes, settings: Settings, on_plane: bool |
 def _way(keyframes: Keyframes, number: Ints) -> Floats:
     """Return the distances (n-1,), m, that the robot drove between consecutive keyframes of `number` (n,).
 
-    They are from the odometry, without its shared errors. Distances between localised places contain the noise of the
-    motions that they weigh: motions that seem short would count for more, and make the map too small. Distances that
-    follow the odometry's scale would make a larger map fit better.
+    The distances are from the odometry, without its shared errors. Distances between localised places contain the noise of
+    the motions that they weigh. With them, motions that seem short would count for more, and the map would be too small.
+    With distances that follow the odometry's scale, a larger map would fit better.
     """
     driven = keyframes.way if keyframes.driven is None else keyframes.driven
     return np.diff(driven[number])
@@ -150,8 +150,8 @@ def _motions(keyframes: Keyframes, number: Ints, parts: tuple[Parts, ...]) -> Lo
 
 
 def localized(keyframes: Keyframes) -> Ints:
-    """Return the keyframes (n,) that count as localised, in increasing order: of the keyframes that one measurement gave a
-    pose, the nearest."""
+    """Return the keyframes (n,) that count as localised, in increasing order. If one measurement gave a pose to several
+    keyframes, only the keyframe nearest in time counts."""
     if (at := keyframes.localized_at) is None:
         return np.arange(len(keyframes))
     order = np.lexsort((np.abs(keyframes.frame_stamps - at), at))
@@ -160,16 +160,17 @@ def localized(keyframes: Keyframes) -> Ints:
 
 
 def sharing(keyframes: Keyframes) -> float:
-    """Return how many keyframes share the information of a measured absolute pose, 1 if `localized_at` tells them apart."""
+    """Return the number of keyframes that share one measured absolute pose. It is 1 if `localized_at` tells them apart."""
     return keyframes.localized_every if keyframes.localized_at is None else 1.0
 
 
 def _of_ground(keyframes: Keyframes, settings: Settings) -> tuple[tuple[Parts, Parts], tuple[Parts, Parts]]:
-    """Return the standard deviations of tilt (rad) and height (m): for each, (K,) of poses and (K-1,) of motions.
+    """Return the standard deviations of tilt (rad) and height (m). The first pair is of poses (K,), the second pair is of
+    motions (K-1,).
 
-    Uneven ground moves a robot as a lasting error would. If `planar.seconds` is 0, motions count for nothing. Poses that
-    share a measurement share its information. The information of the ground is not shared, so the standard deviations undo
-    the division by `localized_every`.
+    Uneven ground moves a robot as a lasting error would. If `planar.seconds` is 0, motions have almost no information. Poses
+    that share a measurement share its information. The information of the ground is not shared, so the standard deviations
+    undo the division by `localized_every`.
     """
     of, root = settings.planar, np.sqrt(sharing(keyframes))
     if not of.seconds:
@@ -187,8 +188,8 @@ def _in_camera(base_T_camera: Floats, variances: Floats) -> Floats:
 
 
 def _chains(keyframes: Keyframes, settings: Settings) -> list[tuple[Floats, Floats]]:
-    """Return the standard deviations of headings (rad) and places (m) of the n keyframes that count as localised: for each,
-    (n,) of poses and (n-1,) of motions."""
+    """Return the standard deviations of the n keyframes that count as localised. The first pair is of headings (rad), the
+    second pair is of places (m). Each pair has one array for poses (n,) and one array for motions (n-1,)."""
     number, of = localized(keyframes), settings.localization
     if not len(number):
         return [(np.zeros(0), np.zeros(0))] * 2
@@ -199,9 +200,9 @@ def _chains(keyframes: Keyframes, settings: Settings) -> list[tuple[Floats, Floa
 
 
 def chain(gaps: Floats, sigma: float, lasting: Lasting, more: Floats | float = 0.0) -> tuple[Floats, Floats]:
-    """Replace correlated errors by independent terms. Return the standard deviations of these terms.
+    """Replace correlated errors by independent terms. Return the standard deviations of the terms.
 
-    Some terms are on single errors (K,), the others on the differences of neighbours (K-1,).
+    The first array is of terms on single errors (K,). The second is of terms on differences of neighbouring errors (K-1,).
 
     The terms are exact if the whole error lasts, or if nothing of it lasts. An error with both parts has no exact terms. Its
     terms have the true information about constant errors, and about errors that change their sign from pose to pose. At the
@@ -211,7 +212,7 @@ def chain(gaps: Floats, sigma: float, lasting: Lasting, more: Floats | float = 0
     Args:
         gaps: (K-1,) s, the times between consecutive errors.
         sigma: the standard deviation of the whole error.
-        lasting: its lasting part.
+        lasting: the lasting part of the error.
         more: (K,) variances of further white errors, or one for all.
     """
     more = np.broadcast_to(more, len(gaps) + 1)

@@ -13,7 +13,7 @@ from objslam.graph.factors.residual_algebra import by_end, huber_roots, whitenin
 
 @dataclass(frozen=True)
 class LocalizedRows:
-    """The between-factors of `LocalizedMotions`, six rows each. first_pose: the first column of the poses."""
+    """The between-factors of `LocalizedMotions` as six rows each. first_pose: the first column of the poses."""
 
     of: LocalizedMotions
     first_pose: int
@@ -41,7 +41,7 @@ class LocalizedRows:
         return self.roots * weight[:, None, None]
 
     def moved(self, map_T_camera: Floats) -> Floats:
-        """Return the motions (s, 4, 4) of poses (P, 4, 4)."""
+        """Return the motions (s, 4, 4) between the poses (P, 4, 4)."""
         return np.asarray(inverse(map_T_camera[self.of.before]) @ map_T_camera[self.of.after])
 
     def rows(self, map_T_camera: Floats, landmarks: Floats) -> tuple[Floats, Floats, float]:

@@ -17,10 +17,10 @@ and less like a norm. This distance is far below the resolution of a map."""
 
 
 def robust(loss: Loss, sigmas: Floats, dimension: int, l1_kink: float = L1_METRES) -> list[gtsam.noiseModel.Base]:
-    """Return one noise model for each of the sigmas (R,). Sigmas are rounded to three digits, so that many share one model.
+    """Return one noise model for each of the sigmas (R,). Sigmas are rounded to three digits, so many rays share one model.
 
     The loss acts on the norm of the whitened residual. The loss `l1` is a Huber loss of slope 1 / sigma that is quadratic
-    below `l1_kink` (unit of the residual). The loss `gnc` gives a Gaussian model: its optimiser applies the loss.
+    below `l1_kink` (unit of the residual). For the loss `gnc`, the model is Gaussian, and the optimiser applies the loss.
     """
     digits = 10.0 ** (np.floor(np.log10(sigmas)) - 2)
     return [_model(loss, sigma, dimension, l1_kink) for sigma in (np.round(sigmas / digits) * digits).tolist()]

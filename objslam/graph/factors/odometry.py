@@ -15,9 +15,9 @@ UNKNOWN_TURN, UNKNOWN_WAY = 0.5, 2.0
 values tie the two keyframes less."""
 
 JUMP = 4.74
-"""The scale of Cauchy's loss, in standard deviations, for a motion that fiducials measure too. Visual odometry jumps when it
-corrects itself: 0.27 m at 0.9 m/s was seen. 99.9 % of all Gaussian errors are below this value (chi-squared, 6 degrees of
-freedom). With a larger value, a jump bends the map more. A smaller value uses less of the odometry."""
+"""The scale of Cauchy's loss, in standard deviations, for a motion that fiducials also measure. Visual odometry jumps when
+it corrects itself: a jump of 0.27 m was seen at 0.9 m/s. 99.9 % of all Gaussian errors are below this value (chi-squared, 6
+degrees of freedom). With a larger value, a jump bends the map more. A smaller value uses less of the odometry."""
 
 
 def motions(
@@ -32,7 +32,7 @@ def motions(
 
     Args:
         on_plane: whether the path is planar. If it is None, the poses decide.
-        pairs: (M,), (M,) the keyframes before and after each motion. If it is None, all K-1 consecutive pairs.
+        pairs: (M,), (M,) the keyframes before and after each motion. None means all K-1 consecutive pairs.
     """
     odom_T_base, drift = keyframes.odom_T_base, keyframes.drift
     if odom_T_base is None or drift is None:
@@ -55,7 +55,8 @@ def _climb(keyframes: Keyframes, odom_T_base: Floats, before: Ints, after: Ints,
     """Return the covariances (M, 6, 6) of motions of a base that moves up or down along its own axes, in the camera frame.
 
     A planar odometry does not say in which plane the robot moves. On a slope, a tilted base moves along its own axes. A base
-    that tilts on its suspension does not. So its motion may leave its plane by the angle `tilt`, rad.
+    that tilts on its suspension does not move along its own axes. So a motion may leave the plane of the base by the angle
+    `tilt`, rad.
     """
     way = np.linalg.norm(odom_T_base[after, :3, 3] - odom_T_base[before, :3, 3], axis=1)
     up = adjoint(inverse(keyframes.base_T_camera[after]))[:, :, 5] * (way * tilt)[:, None]
@@ -65,8 +66,8 @@ def _climb(keyframes: Keyframes, odom_T_base: Floats, before: Ints, after: Ints,
 def wander(keyframes: Keyframes, before: Ints, after: Ints, walk: bool = False) -> Floats:
     """Return the covariances (M, 6, 6) that the interpolation between poses of the odometry adds to motions.
 
-    Like `Keyframes.drift`, they are in the frame of odom_T_base. If a motion is inside one step of the odometry, half of its
-    noise is at each end of the motion.
+    Like `Keyframes.drift`, the covariances are in the frame of odom_T_base. If a motion is inside one step of the odometry,
+    half of its noise is at each end of the motion.
 
     Args:
         before, after: (M,), (M,) the keyframes, with odometry.
@@ -104,7 +105,7 @@ def _on_plane(keyframes: Keyframes, odom_T_base: Floats) -> bool:
 
 
 def motion_floor(base_T_camera: Floats, settings: Settings, on_plane: bool) -> Floats:
-    """Return the least covariance (..., 6, 6) of a motion, in the frame of the camera at base_T_camera (..., 4, 4)."""
+    """Return the floor (..., 6, 6) of the covariance of a motion in the frame of the camera at base_T_camera (..., 4, 4)."""
     return _in_camera(base_T_camera, settings.odometry.floor_yaw, settings.odometry.floor_xy, settings, on_plane)
 
 

@@ -1,11 +1,12 @@
 """The motions by odometry that a graph gets: from keyframe to keyframe, and across the steps of a slow odometry.
 
-Between two poses of the odometry, a keyframe has an interpolated pose. Such errors are not independent, because the odometry
-knows the whole step: a robot that turned late in one motion turned more in the next. So the motions inside a step get the
-loose noise of a random walk, and a tie across the step measures their sum. For a linear system this is exact. Let d be the
-shares of a step that its motions cover. The noise of the motions is D diag(d) from the odometry, plus the bridge W (diag(d)
-- d d'). Then their information is a sum: the information of independent motions with the noise (D + W) d, plus the
-information 1 / D - 1 / (D + W) of a tie.
+Between two poses of the odometry, a keyframe has an interpolated pose. The errors of the motions inside such a step are not
+independent, because the odometry measures the whole step. A robot that turned late in one motion turned more in the next
+motion. So the motions inside a step get the loose noise of a random walk, and a tie across the step measures their sum. For
+a linear system this is exact. Let d be the shares of a step that its motions cover. Let D be the noise of the step by the
+odometry, and W the noise of a random walk over the step. The noise of the motions is D diag(d), plus the noise
+W (diag(d) - d d') of a bridge. The information of the motions is then a sum of two parts. Independent motions with the noise
+(D + W) d have the first part. A tie has the second part, 1 / D - 1 / (D + W).
 """
 
 from dataclasses import dataclass, replace
@@ -21,13 +22,13 @@ from objslam.core.types import Keyframes
 from objslam.graph.factors.odometry import motions, wander
 
 _LEAST_TOLD = 0.1
-"""A tie is used if it gives at least this share of the information about a motion in some direction. With a larger share,
-fewer ties are used, and the motions below them count as independent. With a smaller share, faster odometry has ties too.
-They hardly change the solution, but take time."""
+"""The least share of the information about a motion that a tie must give in some direction. Other ties are not used. With a
+larger share, fewer ties are used, and the motions without a tie count as independent. With a smaller share, faster odometry
+also gets ties. Such ties hardly change the solution, but take time."""
 _NOTHING = 1e-6
-"""In each direction, a tie gets at least this share of the information about a motion. So the information matrix of a tie
-has an inverse, although a tie has no information in directions in which the motions inside a step are not loose. A larger
-share adds more false information there."""
+"""The least share of the information about a motion that a tie gets in each direction. A tie has no information in
+directions in which the motions inside a step are not loose. With this share, the information matrix of a tie still has an
+inverse. A larger share adds more false information in these directions."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,9 @@ class OdometryMotions:
     """M camera motions: first the motions between consecutive keyframes, then the ties. The motions below a tie are the
     motions between its two keyframes.
 
-    before, after: (M,) the keyframes. motion: (M, 4, 4). noise: (M, 6, 6) of the odometry. wander: (M, 6, 6) of the
-    interpolated path, which adds to the noise. loose: (T, 6, 6) for each of the T ties, the noise and wander of the
-    independent motions below it.
+    before, after: (M,) the keyframes. motion: (M, 4, 4). noise: (M, 6, 6) the covariances of the odometry. wander:
+    (M, 6, 6) the covariances of the interpolated path, which add to the noise. loose: (T, 6, 6) for each of the T ties, the
+    wander of the independent motions below the tie.
     """
 
     before: Ints
@@ -73,7 +74,7 @@ class OdometryMotions:
         return float((self.after[chain:] - self.before[chain:]).sum()) / max(chain, 1)
 
     def noise_of(self, keyframes: Keyframes, settings: Settings) -> Floats:
-        """Return the noise (M, 6, 6) of the same motions of other keyframes, or for other settings."""
+        """Return the noise (M, 6, 6) that the same motions have with these keyframes and settings."""
         return motions(replace(keyframes, wander=None), settings, pairs=(self.before, self.after))[1]
 
     def with_noise(self, noise: Floats) -> Self:
@@ -82,7 +83,7 @@ class OdometryMotions:
 
     @cached_property
     def covariance(self) -> Floats:
-        """(M, 6, 6). For a tie, the inverse of the information that the tie adds to the motions below it."""
+        """(M, 6, 6) the covariances of the motions. That of a tie is the inverse of the information that the tie adds."""
         covariance = self.noise + self.wander
         ties = slice(len(self) - len(self.loose), len(self))
         if len(self.loose):
@@ -111,8 +112,8 @@ def below_ties(ties: Ints, count: int) -> Bools:
 def find_ties(keyframes: Keyframes, settings: Settings) -> Ints:
     """Return the pairs (T, 2) of keyframes that need a tie, one after the other along the path.
 
-    A tie connects the keyframes that are nearest to two poses of the odometry, if other keyframes lie between the two. If
-    the interpolation errs by less than the odometry, the tie is left out.
+    A tie connects the keyframes that are nearest to two poses of the odometry, if other keyframes lie between the two. A
+    tie is left out if it adds too little information (`_LEAST_TOLD`), because the interpolation errs little.
     """
     nothing = np.zeros((0, 2), dtype=np.int64)
     if keyframes.step is None or keyframes.wander is None or len(keyframes) < 3:
@@ -132,8 +133,8 @@ def find_ties(keyframes: Keyframes, settings: Settings) -> Ints:
 
 
 def _told(whole: Floats, loose: Floats) -> tuple[Floats, Floats]:
-    """Return which share (T, 6) of the information of `whole` is not in the information of `loose`, along each of six axes,
-    and these axes (T, 6, 6)."""
+    """Return the share (T, 6) of the information of `whole` that `loose` does not have, along each of six axes. Also return
+    the axes (T, 6, 6). whole, loose: (T, 6, 6) covariances."""
     root = np.linalg.cholesky(whole)
     back = np.linalg.inv(root)
     size, axes = np.linalg.eigh(back @ loose @ np.swapaxes(back, 1, 2))

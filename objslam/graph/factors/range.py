@@ -16,7 +16,7 @@ def ranges(
 ) -> list[gtsam.NonlinearFactor]:
     """Return one factor for each of the distances `measured` (R,), m, between X(keyframe) and L(landmark).
 
-    offset: (R, 3) m, the point from which each distance was measured, in the frame of X(keyframe). None means its origin.
+    offset: (R, 3) m, the point from which each distance was measured, in the frame of X(keyframe). None means the origin.
     """
     columns = (keyframe.tolist(), landmark.tolist(), measured.tolist(), noise)
     if offset is None:
@@ -31,10 +31,10 @@ def ranges(
 def along_ray(
     origins: Floats, directions: Floats, measured: Floats, sigmas: Floats, landmark: Ints
 ) -> list[gtsam.NonlinearFactor]:
-    """Return one factor with Huber's loss for each range: the measured (R,) distance, m, of a landmark along a fixed ray.
+    """Return one factor with Huber's loss for each of the ranges `measured` (R,), m, of landmarks along fixed rays.
 
-    Origins (R, 3), m, and unit directions (R, 3) are in map. sigmas: (R,) m, of the distances. A factor does not restrict
-    the landmark across its ray.
+    Origins (R, 3), m, and unit directions (R, 3) are in map. sigmas: (R,) m, the standard deviations of the ranges. A factor
+    does not restrict the landmark across its ray.
     """
     points = origins + directions * measured[:, None]
     roots = np.zeros((len(points), 3, 3))
@@ -47,7 +47,7 @@ def along_ray(
 
 
 def share_bias(rays: Rays, association: Association) -> Rays:
-    """Increase the noise of ranges to account for the bias that all ranges of an object share."""
+    """Return the rays with larger noise of ranges, which accounts for the bias that all ranges of an object share."""
     # If n ranges have noise s and share a bias b, their mean has the variance b^2 + s^2 / n. The mean of n independent
     # ranges with the variance s^2 + n b^2 has the same variance.
     ranged = np.isfinite(rays.range) & (association.object >= 0)

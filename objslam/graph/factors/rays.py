@@ -35,7 +35,7 @@ class Bearings:
 def ray_factors(
     rays: Rays | Bearings, landmark: Ints, loss: Loss, settings: Settings
 ) -> list[tuple[Ints, list[gtsam.NonlinearFactor]]]:
-    """Return two groups of factors, each with the indices (m,) of its rays and one factor for each of these rays.
+    """Return two groups of factors. Each group has the indices (m,) of its rays, and one factor for each index.
 
     The first group has the bearings of all rays, or their distances of Eq. 1 if joint.factor is `point_to_line`. The second
     group has the ranges of the rays with a measured range.

@@ -9,8 +9,8 @@ from objslam.core.statistics import HUBER_K
 def whitening(covariance: Floats) -> Floats:
     """Return upper triangular matrices (n, 6, 6) that whiten residuals with covariances (n, 6, 6), as GTSAM does.
 
-    They are inverse roots of the covariances. The inverse of a covariance itself loses twice the digits, and need not be
-    positive definite if its largest variance is 1e11 times its smallest.
+    The matrices are inverse roots of the covariances. The inverse of a whole covariance would lose twice the digits. If the
+    largest variance is 1e11 times the smallest, this inverse may not be positive definite.
     """
     # The roots are upper triangular, because the axes are in reverse order. The loops fill one entry of all inverses at
     # once, because numpy takes 1 us for the inverse of one small matrix.
@@ -26,7 +26,7 @@ def whitening(covariance: Floats) -> Floats:
 
 
 def huber_roots(size: Floats) -> tuple[Floats, Floats]:
-    """Return the roots (n,) of Huber's weights of whitened norms (n,), and the costs (n,)."""
+    """Return the square roots (n,) of Huber's weights for whitened norms (n,), and the costs (n,)."""
     weight = np.sqrt(np.minimum(1.0, HUBER_K / np.maximum(size, 1e-12)))
     return weight, np.where(size <= HUBER_K, size**2 / 2, HUBER_K * (size - HUBER_K / 2))
 

@@ -1,4 +1,4 @@
 """The joint solve as sparse least squares on arrays.
 
-It is for code that solves one graph many times, with changed measurements.
+This folder is for code that solves one graph many times, with changed measurements.
 """

@@ -1,8 +1,8 @@
 """Solve the normal equations of a chain of poses that see landmarks, by cyclic reduction (Golub and Hockney 1965).
 
-If every motion leads from one pose to the next, the poses form a chain. Every second pose can then be eliminated at once,
-and what is left is a chain of half the length. All poses of a step are eliminated by products of small dense matrices, in
-half the time of a general sparse factorisation. The landmarks are eliminated last, as one dense block.
+If every motion leads from one pose to the next, the poses form a chain. One step eliminates every second pose, and leaves a
+chain of half the length. A step consists of products of small dense matrices. This elimination takes half the time of a
+general sparse factorisation. The landmarks are eliminated last, as one dense block.
 """
 
 from dataclasses import dataclass, replace
@@ -16,15 +16,16 @@ from objslam.core.arrays import Bools, Floats, Ints
 Blocks = tuple[Floats, Floats, Floats, Floats]
 """The blocks of J^T J, as `_gram` returns them."""
 _MOST = 30
-"""The most landmarks of a chain. The time grows with the square of their number, because all of them are coupled with all
-poses. With 15, a factorisation takes half the time of a general one, and with 40 as long, unless all poses see them."""
+"""The largest number of landmarks of a chain. The time grows with the square of the number, because all landmarks are
+coupled with all poses. With 15 landmarks, a factorisation takes half the time of a general one. With 40 landmarks, it takes
+as long, unless all poses see all landmarks."""
 
 
 def is_chain(landmarks: int, before: Ints, after: Ints) -> bool:
     """Return whether motions (s,) between poses are a chain that is solved faster than other graphs.
 
-    In a chain, a motion leads from a pose to the next. Some motions, the ties, may lead farther, one after the other along
-    the path. No two motions have the same ends. landmarks: their number.
+    In a chain, a motion leads from a pose to the next. Some motions, the ties, may lead farther, if they do not overlap
+    along the path. No two motions have the same ends. landmarks: the number of landmarks.
     """
     far = after > before + 1
     first, last = np.sort(before[far]), np.sort(after[far])
@@ -36,10 +37,10 @@ def is_chain(landmarks: int, before: Ints, after: Ints) -> bool:
 class ChainRows:
     """The rows of the Jacobian of P poses in a chain and m landmarks, by the kind of the measurement.
 
-    landmarks, poses: m and P. landmark, pose: (n,) of each ray. ranged: (q,) the rays with a range. before, after: (s,) the
-    poses of each motion, as `is_chain` asks for. bearings: (n, 2, 9) and ranges: (q, 1, 9), by the landmark and then by the
-    pose. weak: (3 m,) by the landmarks. moves: (s, 6, 12) by the pose before and then by the pose after. absolute: (a, 6, 6)
-    by the first a poses.
+    landmarks, poses: m and P. landmark, pose: (n,) the landmark and the pose of each ray. ranged: (q,) the rays with a
+    range. before, after: (s,) the poses of each motion, as `is_chain` asks for. The other fields are derivatives. bearings:
+    (n, 2, 9) and ranges: (q, 1, 9), by the landmark, then by the pose. weak: (3 m,) of the weak priors, by the landmarks.
+    moves: (s, 6, 12) by the pose before, then by the pose after. absolute: (a, 6, 6) by the first a poses.
     """
 
     landmarks: int
@@ -56,8 +57,8 @@ class ChainRows:
     absolute: Floats
 
     def rescaled(self, bearings: float, ranges: Floats, moves: Floats) -> Self:
-        """Return the rows for another noise. bearings: the factor on their rows. ranges: (q,) the factors on their rows.
-        moves: (s, 6, 6) the matrices that multiply theirs."""
+        """Return the rows for another noise. bearings: the factor on the rows of bearings. ranges: (q,) the factors on the
+        rows of ranges. moves: (s, 6, 6) the matrices that multiply the rows of motions."""
         return replace(
             self,
             bearings=bearings * self.bearings,
@@ -68,11 +69,11 @@ class ChainRows:
 
 @dataclass(frozen=True)
 class _Step:
-    """The elimination of every second pose of a chain, k poses.
+    """The elimination of k poses, which are every second pose of a chain.
 
-    inner: (k, 6, 6) the inverse Cholesky factors of the eliminated poses. sides: (k, 6, 12) times the coupling with the pose
-    before and the pose after. border: (k, 6, 3 m) times the coupling with the landmarks. after: how many of the eliminated
-    poses have a pose after them, all or all but the last.
+    inner: (k, 6, 6) the inverse Cholesky factors of the eliminated poses. sides: (k, 6, 12) `inner` times the coupling with
+    the pose before and the pose after. border: (k, 6, 3 m) `inner` times the coupling with the landmarks. after: the number
+    of eliminated poses that have a pose after them, k or k - 1.
     """
 
     inner: Floats
@@ -83,9 +84,10 @@ class _Step:
 
 @dataclass(frozen=True)
 class _Between:
-    """The elimination of one pose below each of some ties, k poses.
+    """The elimination of k poses, one below each of k ties.
 
-    pose: (k,). before: (k,) the first pose of the tie. The pose after is the next one. inner, sides, border: as in `_Step`.
+    pose: (k,) the eliminated poses. before: (k,) the first pose of each tie. The pose after an eliminated pose is the next
+    one. inner, sides, border: as in `_Step`.
     """
 
     pose: Ints
@@ -97,9 +99,9 @@ class _Between:
 
 @dataclass(frozen=True)
 class BelowTies:
-    """The elimination of all poses below ties. What is left is a chain, because each tie joins two neighbours then.
+    """The elimination of all poses below ties. The poses that are left are a chain, because each tie joins two neighbours.
 
-    rounds: the eliminations, one pose of each tie in a round. left: (P,) which poses are left.
+    rounds: the eliminations. A round eliminates one pose of each tie. left: (P,) which poses are left.
     """
 
     rounds: tuple[_Between, ...]
@@ -107,8 +109,8 @@ class BelowTies:
 
     @classmethod
     def of(cls, gram: Blocks, before: Ints, after: Ints, coupling: Floats) -> tuple[Self, Blocks]:
-        """Eliminate the poses from blocks as `_gram` returns them, and return the blocks that are left. The arguments are
-        those of `_ties`."""
+        """Eliminate the poses below ties, and return the blocks that are left. gram: the blocks from `_gram`. before, after,
+        coupling: the ties from `_ties`."""
         diagonal, beside, border, dense = gram
         left = np.ones(len(diagonal), dtype=bool)
         if not len(before):
@@ -133,8 +135,8 @@ class BelowTies:
         return cls(tuple(rounds), left), (diagonal[left], beside[left[:-1]], border[left], dense)
 
     def forward(self, poses: Floats, landmarks: Floats) -> Floats:
-        """Eliminate the poses from a right-hand side (P, 6, n), and return that of the poses that are left. The parts of
-        poses (P, 6, n) and landmarks (3 m, n) change in place."""
+        """Eliminate the poses from a right-hand side, and return its part for the poses that are left. The right-hand sides
+        of all poses (P, 6, n) and of the landmarks (3 m, n) change in place."""
         if not self.rounds:
             return poses
         for one in self.rounds:
@@ -147,8 +149,8 @@ class BelowTies:
         return poses[self.left]
 
     def back(self, poses: Floats, found: Floats, landmarks: Floats) -> Floats:
-        """Return the solution of all poses (P, 6, n). poses: what `forward` left there. found: of the poses that are left.
-        landmarks: (3 m, n) of the landmarks."""
+        """Return the solution of all poses (P, 6, n). poses: the array that `forward` changed. found: the solution of the
+        poses that are left. landmarks: (3 m, n) the solution of the landmarks."""
         if not self.rounds:
             return found
         poses[self.left] = found

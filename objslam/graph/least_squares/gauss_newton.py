@@ -1,6 +1,6 @@
 """Solve a joint graph on arrays, from near its optimum, by Gauss-Newton steps that share their normal equations.
 
-A GTSAM graph has an object for each ray and each motion. To make and linearise them takes longer than such a solve.
+A GTSAM graph has an object for each ray and each motion. To make and linearise these objects takes longer than such a solve.
 """
 
 from collections.abc import Callable
@@ -15,9 +15,9 @@ from objslam.graph.least_squares.joint_rows import JointGraph
 from objslam.graph.least_squares.normal_equations import Equations, factored
 
 _SLOW = 0.5
-"""The normal equations are computed again if the predicted decrease of the cost is more than this share of the decrease that
-the previous step predicted. With a larger share, they are computed more rarely, and a solve takes more steps. With old
-equations, a step takes a fifth of the time."""
+"""The largest ratio of the decrease of the cost that a step predicts to the decrease that the previous step predicted. Above
+this ratio, the normal equations are computed again. With a larger ratio, they are computed more rarely, and a solve takes
+more steps. With old equations, a step takes a fifth of the time."""
 
 OnStep = Callable[[float, Floats, Floats], None]
 """A function that is called after each step with the cost, the poses (P, 4, 4) and the positions (m, 3)."""
@@ -52,9 +52,9 @@ def gauss_newton(
 ) -> Solution:
     """Minimise the cost of a graph. The landmarks start at the means `graph.weak` of their priors.
 
-    A step reuses the normal equations of the previous step (chord method), as long as the cost decreases quickly. They are
-    still nearly right, because only robust weights and directions change between steps. Each step computes the gradient
-    again, so the optimum is the same.
+    A step reuses the normal equations of the previous step (chord method), as long as the cost decreases quickly. These
+    equations are still nearly right, because only robust weights and directions change between steps. Each step computes the
+    gradient again, so the optimum is the same.
 
     Args:
         graph: the measurements.

@@ -41,17 +41,17 @@ class JointRows:
 
     @cached_property
     def _derived(self) -> tuple[sparse.csr_matrix, ChainRows | None]:
-        """The rows after the last step of a solve, or after a step that is not taken, need no derivatives."""
+        """The derivatives, computed at their first use. After the last step of a solve, or a refused step, none are used."""
         return self.derive()
 
     @property
     def jacobian(self) -> sparse.csr_matrix:
-        """(M, D) by the landmarks, three columns each, then by the poses, six columns each."""
+        """(M, D) the derivatives of the residuals. First, each landmark has three columns. Then, each pose has six."""
         return self._derived[0]
 
     @property
     def chain(self) -> ChainRows | None:
-        """The same derivatives by kind, None if the poses are no chain that sees few landmarks."""
+        """The same derivatives by kind. None unless the poses are a chain that sees few landmarks."""
         return self._derived[1]
 
 
@@ -94,7 +94,7 @@ class JointGraph:
 
     @cached_property
     def further(self) -> tuple[SquareRows, *tuple[RowsOfKind, ...]]:
-        """The kinds of factors that bring their own rows. The first are the fiducials, whose corners are landmarks."""
+        """The kinds of factors that make their own rows. The first kind is the fiducials, whose corners are landmarks."""
         return self.measured.further_rows(self.landmarks)
 
     @cached_property
@@ -168,14 +168,15 @@ class JointGraph:
         return ray_residuals(directions, to_landmark, axes, self._metric)
 
     def bearing_roots(self, residuals: Floats) -> tuple[Floats, Floats]:
-        """Return the factors (n, 1) that whiten residuals (n, 2), with the weights of their loss, and their costs (n,)."""
+        """Return the factors (n, 1) that whiten residuals (n, 2) and weigh them by the loss. Also return the costs (n,)."""
         sigma = np.full(len(self.rays), EQ1_SIGMA) if self._metric else self.rays.sigma
         size = lengths(residuals) / sigma
         weight, cost = (np.ones_like(size), size**2 / 2) if self.gaussian else huber_roots(size)
         return (weight / sigma)[:, None], cost
 
     def range_roots(self, distances: Floats) -> tuple[Floats, Floats]:
-        """Return the factors (q,) that whiten distances (q,), m, with the weights of Cauchy's loss, and their costs (q,)."""
+        """Return the factors (q,) that whiten the residuals of distances (q,), m, and weigh them by Cauchy's loss. Also
+        return the costs (q,)."""
         sigma = self.rays.range_sigma[self.ranged]
         square = ((distances - self.rays.range[self.ranged]) / sigma / CAUCHY_K) ** 2
         return 1 / sigma / np.sqrt(1 + square), CAUCHY_K**2 / 2 * np.log1p(square)
@@ -246,7 +247,7 @@ class JointGraph:
     def motion_weights(self, map_T_camera: Floats) -> Floats:
         """Return the roots (s,) of the weights of motions.
 
-        A motion that fiducials measure too has Cauchy's loss. Other motions have none.
+        A motion that fiducials also measure has Cauchy's loss. The weights of other motions are 1.
         """
         return self._moves(map_T_camera).weight
 
@@ -276,8 +277,8 @@ class JointGraph:
 class _Moves:
     """The motions by odometry at some poses.
 
-    moved: (s, 4, 4) the motions of the poses. off: (s, 6) the twists from the measured motions. roots: (s, 6, 6) matrices
-    that whiten the twists, with the roots of the robust weights (s,) in them. residual: (s, 6) whitened. cost: (s,).
+    moved: (s, 4, 4) the motions of the poses. off: (s, 6) the twists from the measured motions. weight: (s,) the roots of
+    the robust weights. roots: (s, 6, 6) matrices that whiten and weigh the twists. residual: (s, 6) whitened. cost: (s,).
     """
 
     moved: Floats
@@ -302,8 +303,8 @@ class _Moves:
 def _put_by_seen(rows: Floats, by_seen: Floats, seen: Floats, to_map: Floats) -> None:
     """Write the derivatives (n, k, 9) of k residuals of each ray by its landmark and its pose.
 
-    by_seen: (n, k, 3) by the landmark `seen` (n, 1, 3), both in the camera frame. to_map: (n, 3, 3) the rotations from
-    map to this frame.
+    by_seen: (n, k, 3) the derivatives by the landmark `seen` (n, 1, 3), both in the camera frame. to_map: (n, 3, 3) the
+    rotations from map to this frame.
     """
     np.matmul(by_seen, to_map, out=rows[..., :3])
     rows[..., 3:6] = cross(by_seen, seen)

@@ -22,9 +22,9 @@ def load_libraries() -> None:
 
 
 def _import_later(name: str) -> None:
-    """Let a module load at its first use. Its parent must be imported already.
+    """Let a module load at its first use. The parent of the module must be imported already.
 
-    Other libraries import such a module only to copy its names into another module. Then the module is not loaded. Nothing
+    If another library imports the module only to copy its name into another module, the module is not loaded. Nothing
     happens if the module is imported already, or does not exist.
     """
     spec = None if name in sys.modules else find_spec(name)

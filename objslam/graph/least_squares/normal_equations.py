@@ -28,8 +28,7 @@ class NormalEquations:
 
     @property
     def least_pivot(self) -> float:
-        """The least pivot. The smaller it is compared with the entries of J^T J, the more digits the elimination has
-        lost."""
+        """The smallest pivot. If it is small compared with the entries of J^T J, the elimination has lost many digits."""
         return float(self.factored.U.diagonal().min())
 
     @property
@@ -44,8 +43,8 @@ class NormalEquations:
         return found
 
     def late(self, columns: Ints, most: int) -> Ints:
-        """Return the columns, among `columns` (n,), that are among the last `most` eliminated columns. `last_block` takes
-        them."""
+        """Return the subset of `columns` (n,) that is among the last `most` eliminated columns. `last_block` takes this
+        subset."""
         straight = np.arange(len(self.order))
         if not all(np.array_equal(p, straight) for p in (self.factored.perm_c, self.factored.perm_r)):
             return columns[:0]
@@ -108,7 +107,7 @@ def _reordered(jacobian: sparse.csr_matrix, order: Ints) -> sparse.csc_matrix:
     rank[order] = np.arange(len(order))
     moved = sparse.csr_matrix((jacobian.data, rank[jacobian.indices], jacobian.indptr), shape=jacobian.shape)
     product = sparse.csc_matrix(moved.T @ moved)
-    product.has_sorted_indices = True  # Otherwise, scipy sorts them, which takes as long as the product. SuperLU need not.
+    product.has_sorted_indices = True  # Otherwise, scipy sorts them, as slowly as the product. SuperLU needs no order.
     return product
 
 

@@ -25,7 +25,7 @@ def tie_frame(graph: IncrementalGraph, map_T_graph: Floats) -> None:
 def tie_objects(graph: IncrementalGraph, landmarks: Ints, own: Floats, position: Floats, covariance: Floats) -> None:
     """Tie landmarks (n,) to objects of the map with positions (n, 3) m and covariances (n, 3, 3) m^2.
 
-    F must be in the graph. own: (n, 3, 3) m^2, in the frame of the graph: the covariance of the errors that the graph does
+    F must be in the graph. own: (n, 3, 3) m^2, the covariances, in the frame of the graph, of the errors that the graph does
     not contain, such as the offsets of boxes.
     """
     frame = map_T_graph(graph)
@@ -45,7 +45,7 @@ def untie(graph: IncrementalGraph) -> None:
 
 
 def map_T_graph(graph: IncrementalGraph) -> Floats | None:
-    """Return the pose (4, 4) of the frame of the graph in the map at the last `refresh`. None if it is not tied to a map."""
+    """Return the pose (4, 4) of the graph's frame in the map at the last `refresh`. None if the graph has no map."""
     frame = graph.variable(F0)
     return None if frame is None else np.asarray(frame.matrix())
 

@@ -1,13 +1,13 @@
 """Solve a drive once more, with objects of an older map as priors: its poses, its objects, and its frame in the map.
 
 The graph of the drive stays in its own frame. The pose of this frame in the map is one more variable, F. Each object has two
-points. The rays of the drive point to L(j), in the frame of the drive. P(j) = F * L(j) + e(j) is in the map. The error e(j)
-is the sum of the errors that the graph of the drive does not contain, such as the offsets of boxes. If the map has the
-object, its estimate is the prior of P(j).
+points. The rays of the drive point to L(j), in the frame of the drive. The other point, P(j) = F * L(j) + e(j), is in the
+map. The error e(j) is the sum of the errors that the graph of the drive does not contain, such as the offsets of boxes. If
+the map has the object, the map's estimate of the object is the prior of P(j).
 
 The registration gives only the start and the matches, so that the map counts once. The objects of a drifted map share
-errors, but the map does not say which. So the priors count as independent. So many objects would make the frame look too
-exact. Therefore, the largest error that all objects can share is added to the covariance of the frame.
+errors, but the map does not say which errors. So the priors count as independent. With many objects, the frame would then
+look too exact. Therefore, the largest error that all objects can share is added to the covariance of the frame.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,8 @@ LEAST = 1e-3
 """The least standard deviation (m) of an error of an object. A larger value makes exact maps less exact. This value is far
 below the errors of real maps, and keeps the linear system well conditioned."""
 _ITERATIONS = 50
-"""The most iterations of the solve. Usually a handful is enough, for the registration is a close start. More are slower."""
+"""The largest number of iterations of the solve. A larger number is slower. Usually a handful is enough, because the
+registration is a close start."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ def _poses(estimate: Estimate, measured: Measurements | None) -> Floats:
 def _drive_factors(
     estimate: Estimate, association: Association, solved: Ints, measured: Measurements | None, *, robust: bool
 ) -> list[gtsam.NonlinearFactor]:
-    """Return the factors of the drive alone. At fixed poses, these are priors with half the covariance of each object.
+    """Return the factors of the drive alone. At fixed poses, they are priors with half the covariance of each object.
 
     robust: whether the rays have the loss of the settings. `gnc` gives no loss, because only its own optimiser applies it.
     """
@@ -152,7 +153,7 @@ def _unknown_to(
 
 
 def beyond(covariance: Floats, alone: Floats) -> Floats:
-    """Return by how much covariances (n, 3, 3), m^2, exceed `alone` (n, 3, 3): at least `LEAST`^2 along each axis."""
+    """Return the excess (n, 3, 3), m^2, of covariances over `alone` (n, 3, 3). It is at least `LEAST`^2 along each axis."""
     size, axes = np.linalg.eigh(covariance - alone)
     return np.asarray((axes * np.maximum(size, LEAST**2)[:, None, :]) @ np.swapaxes(axes, 1, 2))
 
@@ -176,9 +177,9 @@ def _covariances(
 def shared_at_most(positions: Floats, covariance: Floats, pivot: Floats) -> Floats:
     """Return the covariance (4, 4) of the largest error that all objects of a map can share: a shift (m) and a yaw (rad).
 
-    The error of each object contains the shared error. So the shift has the smallest covariance of all objects. The yaw
-    turns about the pivot (3,) m, and moves no object by more than its standard deviation. positions: (M, 3) m. covariance:
-    (M, 3, 3) m^2.
+    The error of each object contains the shared error. So the covariance of the shift is the smallest covariance of an
+    object. The yaw turns about the pivot (3,) m, and moves no object by more than the object's standard deviation.
+    positions: (M, 3) m. covariance: (M, 3, 3) m^2.
     """
     level = np.trace(covariance[:, :2, :2], axis1=1, axis2=2) / 2
     lever = ((positions - pivot)[:, :2] ** 2).sum(axis=1)
@@ -193,8 +194,8 @@ def _with_doubt(
 ) -> Floats:
     """Add the error that all map objects share to the covariances `spread` (n, 3, 3), m^2, of points `placed` (n, 3), m.
 
-    doubt: (4, 4) the covariance of this error, from `shared_at_most`. there: (n,) the objects. index: (M,) those with a
-    prior. prior: (M, 3, 3) m^2. The more a prior determines a point, the less the shared error moves it.
+    doubt: (4, 4) the covariance of this error, from `shared_at_most`. there: (n,) the objects. index: (M,) the objects with
+    a prior. prior: (M, 3, 3) m^2. The more a prior determines a point, the less the shared error moves the point.
     """
     move = np.zeros((len(there), 3, 4))
     move[:, :, :3] = np.eye(3)

@@ -2,11 +2,11 @@
 
 A map can explain more rays, or explain them more closely, if it bends the path. Then the odometry disagrees, and a solve
 that estimates the noise finds more noise in the odometry. The evidence counts both: each measurement has a density, which is
-lower if its noise is larger. It is integrated over poses and landmarks. So each landmark has a cost, which is larger for a
-better determined landmark (Occam factor; MacKay, Information Theory, 2003, chapter 28).
+lower if its noise is larger. The product of the densities is integrated over poses and landmarks. So each landmark has a
+cost, which is larger for a better determined landmark (Occam factor; MacKay, Information Theory, 2003, chapter 28).
 
-The ranges of one visit to a thing err alike: they end on the same part of it, or on what stands before it. If each range
-counted for itself, a map with the thing at several places, one for each visit, would be the better one.
+The ranges of one visit to a thing err alike, because they end on the same part of the thing, or on what stands before it. If
+each range counted for itself, a map with the thing at another place for each visit would have more evidence.
 """
 
 import numpy as np
@@ -23,17 +23,19 @@ _VIEW = 1.0
 rays counts more, and their noise less."""
 
 _ITERATIONS = 10
-"""How often the bias that errors share is computed with new robust weights. Five are usual. More are slower."""
+"""The number of times that the bias that errors share is computed with new robust weights. Five are usual. A larger number
+is slower."""
 
 _AWAY = 3.0
-"""The shortest time (s) without a box of a thing between two visits. With a longer time, more ranges share an error."""
+"""The shortest time (s) without a box of a thing that separates two visits to it. With a longer time, more ranges share an
+error."""
 
 _FEWEST = 3
-"""The fewest ranges of a visit that show the noise of single ranges. In a visit of two, one of them is the median."""
+"""The least number of ranges of a visit that show the noise of single ranges. Of only two ranges, one is the median."""
 
 _PRIOR_VISITS = 2
-"""The bias in the settings weighs as much as this number of visits in the bias of each label. With a larger number, labels
-differ less."""
+"""The weight of the bias in the settings, as a number of visits, in the estimate of the bias of each label. With a larger
+number, labels differ less."""
 
 
 def log_evidence(
@@ -54,8 +56,9 @@ def log_evidence(
         distance: (n,) m, from the origin of each used ray to its landmark.
         solved: the graph at its solution, with its Gaussian noise.
         cost: the cost of the solution, which is half the sum of the squared residuals, with the robust losses.
-        ranges_open: whether the noise of ranges is estimated. Then their density has the noise that the association shows,
-            and each visit has a bias of its own. Otherwise, the ranges of a landmark share the bias of the settings.
+        ranges_open: whether the noise of ranges is estimated. If so, the density of ranges has the noise that the
+            association shows, and each visit has its own bias. If not, the ranges of a landmark share the bias of the
+            settings.
 
     Returns:
         The log evidence, -inf if the linear system is indeterminate.
@@ -101,11 +104,11 @@ def _of_ranges(measured: Measurements, association: Association, used: Bools, di
 def _noise_of_visits(
     off: Floats, variance: Floats, bias: Floats, visit: Ints, label: Ints, prior: float
 ) -> tuple[Floats, Floats]:
-    """Return the variance (n,) m^2 of each range without the bias, and that of the bias of its visit, as the errors show it.
+    """Return two variances (n,) m^2 for each range: of the range without the bias, and of the bias of its visit.
 
-    Each label has a factor on its variance, and one bias, because a camera sees through the things of some labels, or past
-    them. off, variance, bias: as in `shared_bias_density`, with the noise of the solve. label: (n,). prior: the weight of
-    this noise, as a number of ranges.
+    The errors `off` determine both variances. Each label has a factor on its variance, and one bias, because a camera sees
+    through the things of some labels, or past them. off, variance, bias: as in `shared_bias_density`, with the noise of the
+    solve. label: (n,). prior: the weight of the noise of the solve, as a number of ranges.
     """
     visits, labels = int(visit.max(initial=-1)) + 1, int(label.max(initial=-1)) + 1
     number, middle = np.bincount(visit, minlength=visits), grouped_median(off, visit, visits)
@@ -131,7 +134,7 @@ def shared_bias_density(off: Floats, variance: Floats, bias: Floats, group: Ints
     Args:
         off: (n,) m, the errors.
         variance: (n,) m^2, of each error without the bias.
-        bias: (n,) m^2, the variance of the bias. The mean of a group counts.
+        bias: (n,) m^2, the variance of the bias. Each group uses the mean of its values.
         group: (n,) the group of each error, below `count`.
         count: the number of groups.
     """

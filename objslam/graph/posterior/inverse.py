@@ -12,14 +12,15 @@ from objslam.errors import SolveError
 from objslam.graph.least_squares.normal_equations import NormalEquations, elimination_order
 
 LEAST_PIVOT = 1e-11
-"""A system has a single solution if every pivot of its information matrix, scaled to 1 on the diagonal, is at least this.
-Rounding leaves a pivot of about 1e-15 if a system has no single solution. A larger value refuses more systems that have a
-solution, but are badly conditioned."""
+"""The smallest pivot of a system with a single solution. The pivots are those of the information matrix, scaled to 1 on the
+diagonal. Rounding leaves a pivot of about 1e-15 if a system has no single solution. A larger value refuses more systems that
+have a solution, but are badly conditioned."""
 _COLUMNS = 48
 """The number of columns of the inverse that are computed at once. A larger number takes more memory."""
 _DENSE, _EACH = 2000, 8
-"""The most columns of a dense block of the inverse: in all, and for each requested column. Beyond these limits, single
-columns take less time. With larger numbers, dense blocks are used more often."""
+"""The largest numbers of columns of a dense block of the inverse. The first limits all columns, the second limits them for
+each requested column. Beyond these limits, single columns take less time. With larger numbers, dense blocks are used more
+often."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class Inverse:
         """Return the block (d, d) of the inverse for each group of variables, in the order of their keys."""
         asked = [self.columns(group) for group in groups]
         late, block = self._late_block(np.unique(np.concatenate(asked)) if asked else np.zeros(0, dtype=np.int64))
-        # A landmark that few poses see is eliminated early. It takes columns of its own, but the others still need none.
+        # A landmark that few poses see is eliminated early, and needs whole columns. The other landmarks still need none.
         in_block = [bool(np.isin(own, late).all()) for own in asked]
         alone = iter(self._by_columns([own for own, here in zip(asked, in_block, strict=True) if not here]))
         places = [np.searchsorted(late, own) for own in asked]
@@ -105,7 +106,7 @@ class Inverse:
         return found
 
     def times(self, at: Ints, right: Floats) -> Floats:
-        """Return the part of the inverse at some columns (d,), times vectors (d, m)."""
+        """Return the product (d, m) of the block of the inverse at the columns `at` (d,) and vectors (d, m)."""
         late, block = self._late_block(at)
         if len(late) == len(at):
             return np.asarray(block @ right)

@@ -32,9 +32,10 @@ from objslam.graph.tags.estimate import with_objects
 class SolvedErrors:
     """The shared errors of a joint solve.
 
-    errors: the measurements as a function of them, with the noise that was found. None if there are none. calibration:
-    their values, None without errors. sensitivity: (N, 3, P) of the landmarks, m per unit of each error, NaN for a landmark
-    outside the graph. None if the errors were held. failed: whether they could not be estimated.
+    errors: the measurements as a function of the shared errors, with the noise that was found. None without shared errors.
+    calibration: the values of the errors, None without errors. sensitivity: (N, 3, P) the derivatives of the landmarks, m
+    per unit of each error, NaN for a landmark outside the graph. None if the errors were held. failed: whether the
+    estimation of the errors failed.
     """
 
     errors: CalibratedMeasurements | None = None
@@ -48,7 +49,7 @@ def estimate_of(
 ) -> Estimate:
     """Return the estimate of a joint solution. The ledger counts landmarks without a covariance.
 
-    association: of the landmarks, which are objects or corners of fiducials.
+    association: the landmark of each ray. The landmarks are objects or corners of fiducials.
     """
     rays, optimum, positions, tags = measured.rays, found.optimum, found.positions, measured.tags
     used, map_T_camera = found.used, found.map_T_camera
@@ -97,9 +98,9 @@ def estimate_of(
 
 
 def _covariances(solved: Solved, positions: Floats, ledger: Ledger) -> tuple[Floats, Floats]:
-    """Return the covariances (N, 3, 3) m^2 of the landmarks, and the factor (N, 3, F) of the part that they share.
+    """Return the covariances (N, 3, 3) m^2 of the landmarks, and the factor (N, 3, F) m of their correlated part.
 
-    Both are without shared errors. positions: (N, 3) m, NaN for a landmark outside the graph.
+    Both do not contain the shared errors of the calibration. positions: (N, 3) m, NaN for a landmark outside the graph.
     """
     landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
     covariance = np.full((len(positions), 3, 3), np.nan)
@@ -120,9 +121,10 @@ def _seen_sigma(
     covariance: Floats,
     ledger: Ledger,
 ) -> Floats:
-    """Return the largest standard deviation (N,) m of each landmark, as seen from a keyframe if it is large in the map.
+    """Return the largest standard deviation (N,) m of each landmark. If it is large in the map, a keyframe is the reference.
 
-    inliers: (R,). covariance: (N, 3, 3) m^2 in the map. Far from the start, all landmarks share the error of the path there.
+    The keyframe is one that sees the landmark. Far from the start, all landmarks share the error of the path to them.
+    inliers: (R,). covariance: (N, 3, 3) m^2 in the map.
     """
     witness = _witnesses(measured.rays, association, inliers)
     sigma = largest_sigma(covariance)

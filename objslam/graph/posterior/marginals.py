@@ -26,8 +26,8 @@ deviation of a landmark is still above half of this value, no measurement determ
 the landmarks less. With too large a value, the system stays indeterminate."""
 
 _DIRECTIONS = 20
-"""The number of directions in which correlations between landmarks are kept. The shift, turn and size of a map take seven.
-With a larger number, the bends of a long path count too, and the search takes longer."""
+"""The number of directions in which correlations between landmarks are kept. The shift, turn and size of a map take seven
+directions. With a larger number, the bends of a long path also count, and the search takes longer."""
 _ITERATIONS = 3
 """The number of steps of the search for the directions in which correlations are kept. More steps are more exact, and take
 longer."""
@@ -59,8 +59,8 @@ class SolvedMeasurements:
     come from arrays.
 
     measured, association: the measurements, and the landmark of each ray. used: (R,) the rays in the graph. map_T_camera:
-    (P, 4, 4). positions: (N, 3) m, NaN for a landmark that is not in the graph. near: an earlier solve. If it had the same
-    variables, its order of elimination is taken.
+    (P, 4, 4). positions: (N, 3) m, NaN for a landmark that is not in the graph. near: an earlier solve. Its order of
+    elimination is used if it had the same variables.
     """
 
     measured: Measurements
@@ -178,7 +178,7 @@ def joint_covariances(solved: Solved, groups: Sequence[Sequence[int]]) -> list[F
 
     The normal equations are factored once for all groups. GTSAM eliminates the system again for each group, which takes 20
     times as long for 150 landmarks that were seen together. GTSAM is used only if the normal equations lose too many digits.
-    GTSAM names the variable that is not determined. RuntimeError if GTSAM, too, finds the system indeterminate.
+    GTSAM names the variable that is not determined. RuntimeError if GTSAM also finds the system indeterminate.
     """
     if solved.inverse is not None:
         return solved.inverse.blocks(groups)
@@ -198,11 +198,11 @@ def in_order(joint: gtsam.JointMarginal, keys: Sequence[int]) -> Floats:
 
 
 def correlated_factor(solved: Solved, landmarks: Ints, covariance: Floats) -> Floats:
-    """Return the correlated errors of landmarks (n,), as a factor (n, 3, m), m, of their joint covariance.
+    """Return the correlated errors of landmarks (n,), as a factor (n, 3, F), in metres, of their joint covariance.
 
     covariance: (n, 3, 3) m^2 of the landmarks. A few products with the joint covariance find its strongest directions
     (subspace iteration). So the time grows with the number of landmarks, not with the square of this number. The factor
-    comes from the Nystroem approximation, which is nowhere above the joint covariance. m is 0 if the linear system is
+    comes from the Nystroem approximation, which is nowhere above the joint covariance. F is 0 if the linear system is
     indeterminate.
     """
     none = np.zeros((len(landmarks), 3, 0))

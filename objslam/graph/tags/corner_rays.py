@@ -16,7 +16,7 @@ from objslam.graph.tags.square_fit import Corners, independent
 
 @dataclass(frozen=True)
 class TagCorners:
-    """The T fiducials among N objects. Each fiducial becomes four landmarks, its corners. M = N + 3 T landmarks in all.
+    """The T fiducials among N objects. The four corners of each fiducial become landmarks, M = N + 3 T landmarks in all.
 
     The rays to corners replace the rays to fiducials. source: (n,) the original ray of each ray, non-decreasing. corner:
     (n,) the corner of each ray, 0 to 3, -1 for a ray that is not to a corner. association: the landmark of each ray. The
@@ -92,7 +92,7 @@ class TagCorners:
         return replace(new, direction=direction, sigma=sigma, range=range_, corners=None, corner_sigma=None)
 
     def seen(self, rays: Rays, map_T_camera: Floats) -> Corners:
-        """Return the corners in all views of fiducials, with the camera poses (K, 4, 4). rays: (n,) the new rays."""
+        """Return the corners in all views of fiducials, at the camera poses (K, 4, 4). rays: (n,) the new rays."""
         views = (self.first[:, None] + np.arange(4)).ravel()
         origin, direction = rays.take(views).in_map(map_T_camera)
         return Corners(
@@ -114,8 +114,8 @@ class TagCorners:
         return np.flatnonzero(np.isin(self.landmarks, landmarks).all(axis=1))
 
     def of_objects(self, values: Floats) -> Floats:
-        """Return values of the objects (N, ...) for values of the landmarks (M, ...): the mean over the corners of each
-        fiducial."""
+        """Return the values of the objects (N, ...) from values of the landmarks (M, ...). A fiducial has the mean value of
+        its corners."""
         found = values[: self.count].copy()
         found[self.object] = values[self.landmarks].mean(axis=1)
         return found
@@ -125,7 +125,7 @@ class TagCorners:
         return np.isin(np.arange(self.association.count), self.landmarks)
 
     def object_of_landmark(self) -> Ints:
-        """Return the object (M,) of each landmark."""
+        """Return the object (M,) of each landmark. The object of a corner is its fiducial."""
         objects = np.arange(self.association.count)
         objects[self.landmarks] = self.object[:, None]
         return objects

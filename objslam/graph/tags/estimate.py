@@ -21,7 +21,7 @@ from objslam.graph.variables import L0, TAG0, TAG_SIZE0
 Covariances = Callable[[Sequence[Sequence[int]]], list[Floats]]
 """A function of groups of keys that returns the covariance of each group, as `marginals.joint_covariances` does."""
 LEAST_PROBABILITY = 0.01
-"""The second rotation of a flat square is reported if its probability is at least this. A larger value reports fewer."""
+"""The least probability of a second rotation of a flat square that is reported. A larger value reports fewer rotations."""
 
 
 def with_objects(
@@ -42,9 +42,10 @@ def with_objects(
 
     Args:
         rays: (n,) the new rays. map_T_camera: (P, 4, 4) the solved camera poses.
-        values: the solved values of the graph. covariances: of its variables.
+        values: the solved values of the graph. covariances: the function that returns covariances of its variables.
         wider: (M,) the factor on the covariance of each landmark.
-        sensitivity: (M, 3, P) of the landmarks by the shared errors of `estimate.calibration`, None without such errors.
+        sensitivity: (M, 3, P) the derivatives of the landmarks by the shared errors of `estimate.calibration`, None without
+            such errors.
         ledger: gets a warning if the graph has no covariances.
     """
     which = tags.tied(np.flatnonzero(estimate.solved))
@@ -125,15 +126,15 @@ def _of_squares(local: Floats, rotation: Floats) -> Floats:
 def _second(
     tags: TagCorners, rays: Rays, map_T_camera: Floats, which: Ints, rotation: Floats, wider: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the second rotations (t, 3, 3) of fiducials, their probabilities (t,), and the shifts (t, 3) m to their
-    positions.
+    """Return the second rotations (t, 3, 3) of fiducials, their probabilities (t,), and the shifts (t, 3) m from the first
+    positions to the second.
 
     which: (t,) the fiducials. rotation: (t, 3, 3) the solved rotations. wider: (M,) as in `with_objects`. Both poses are
     compared at the solved camera poses, as if one of the two were the truth.
     """
     found = place(tags.seen(rays, map_T_camera), tags.shape, tags.side)
     best, other = found.best.take(which), found.other.take(which)
-    cost = np.where(np.isfinite(found.cost), found.cost, 0.0)  # Without a pose, the other cost is infinite too.
+    cost = np.where(np.isfinite(found.cost), found.cost, 0.0)  # Without a pose, the other cost is also infinite.
     gain = (found.other_cost - cost)[which] / wider[tags.object[which]]
     off = [np.linalg.norm(rotation_vector(np.swapaxes(rotation, 1, 2) @ o.pose[:, :3, :3]), axis=1) for o in (best, other)]
     swapped = (off[1] < off[0]) & np.isfinite(gain)

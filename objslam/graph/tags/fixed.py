@@ -14,19 +14,19 @@ from objslam.graph.tags.placement import place
 from objslam.graph.tags.square_fit import fit, scatter, with_pose_noise
 
 _NOMINAL = 30.0
-"""The scatter of the views of a fiducial may be larger than the nominal noise. With this many views, half of the difference
-counts. A fiducial has seven parameters, so the scatter of n views gives a variance with a relative error of about
-sqrt(7 / n). At 30 views, this is a half. With a larger number, the nominal noise counts more."""
+"""The number of views of a fiducial with which half of their excess scatter counts. The excess is the scatter of the views
+minus the nominal noise. A fiducial has seven parameters, so the scatter of n views gives a variance with a relative error of
+about sqrt(7 / n). With 30 views, this error is a half. With a larger number, the nominal noise counts more."""
 _STEPS = 5
-"""The iterations of a fit to all views. It starts at a pose that fits some of the views. More iterations are slower."""
+"""The number of iterations of a fit to all views, from a pose that fits some of the views. More iterations are slower."""
 
 
 def tags_at_poses(keyframes: Keyframes, rays: Rays, association: Association, settings: Settings) -> dict[int, TagPose]:
     """Return the rotation and size of each fiducial by the index of its object, from all its views at fixed poses.
 
-    The error of a pose is common to the four corners of a view (`square_fit.with_pose_noise`). The covariance follows from
-    the nominal noise. It is larger if the views scatter more. A fiducial has no entry if its views do not determine its
-    size.
+    The error of a camera pose is common to the four corners of a view (`square_fit.with_pose_noise`). The covariance follows
+    from the nominal noise, and is larger if the views scatter more. A fiducial has no entry if its views do not determine
+    its size.
     """
     tags = TagCorners.of(rays, association, settings)
     if tags is None:

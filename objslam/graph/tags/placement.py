@@ -11,29 +11,30 @@ from objslam.graph.tags.shapes import squares_of
 from objslam.graph.tags.square_fit import Corners, Squares, costs, fit, mirrored, poses_of_views, stacked
 
 _CANDIDATES = 8
-"""The most views of a fiducial whose two poses are tried: half of them are the nearest, the others are spread over time. A
-larger number is slower, and finds the pose more often if many views are false."""
+"""The largest number of views of a fiducial whose two poses are tried. Half of them are the nearest views, and the others
+are spread over time. A larger number is slower, and finds the pose more often if many views are false."""
 _VIEWS = 64
-"""A pose of a fiducial is judged on at most this number of its views, spread over time. A larger number is slower and judges
-better."""
+"""The largest number of views on which a pose of a fiducial is judged. They are spread over time. A larger number is slower
+and judges better."""
 _STEPS, _STEPS_LAST = 6, 15
-"""The iterations of a fit to one view, and of the last fit. More iterations are slower. Both usually converge in five."""
+"""The numbers of iterations of a fit to one view, and of the last fit. Larger numbers are slower. Both fits usually converge
+in five iterations."""
 _TOLD = 4.0
-"""A fiducial of unknown size gets a pose only if its views give more than this information about the logarithm of its side.
-The value is 1 / 0.5^2. With a larger value, fewer such fiducials get a pose."""
+"""The information about the logarithm of the side above which a fiducial of unknown size gets a pose. The value is
+1 / 0.5^2. With a larger value, fewer such fiducials get a pose."""
 _SAME = np.radians(3.0)
 """The largest angle (rad) between two poses that count as one. With a larger angle, more fiducials have a single pose."""
 _CLEARLY = 1.0
-"""A fiducial is moved to a new pose if this decreases its cost (a robust sum of squared deviations) by more than this value.
-A decrease by 1 means odds of e^(1/2). A larger value leaves more fiducials where they are."""
+"""The decrease of the cost (a robust sum of squared deviations) above which a fiducial is moved to a new pose. A decrease by
+1 means odds of e^(1/2). A larger value leaves more fiducials where they are."""
 
 
 @dataclass(frozen=True)
 class Placement:
     """The best pose of each of T fiducials for given camera poses, and a second pose.
 
-    best, other: the squares at these poses. cost, other_cost: (T,), Cauchy's loss, infinite for a fiducial without that
-    pose. information: (T, 7, 7) of the best, as in `square_fit.fit`.
+    best, other: the squares at the two poses. cost, other_cost: (T,) the costs of the poses by Cauchy's loss, infinite for a
+    fiducial without that pose. information: (T, 7, 7) about the best pose, as in `square_fit.fit`.
     """
 
     best: Squares
@@ -47,7 +48,7 @@ def place(seen: Corners, shapes: Floats, sides: Floats) -> Placement:
     """Return the best pose of each of T fiducials, and its second pose.
 
     A single view gives two poses. The two poses of each of `_CANDIDATES` views are tried in `_VIEWS` views. The best pose is
-    fitted to the `_VIEWS` views. The mirror image of the best pose is fitted too, because both poses fit if the views have
+    fitted to the `_VIEWS` views. The mirror image of the best pose is also fitted, because both poses fit if the views have
     little parallax. An unknown side comes from the parallax of the views.
 
     seen: views of the fiducials. shapes: (T, 4, 3). sides: (T,) m, NaN if unknown.
@@ -141,7 +142,7 @@ def _views_of_each(owner: Ints, judges: Corners, count: int) -> Corners:
 def _side_of_parallax(squares: Squares, origins: Floats, seen: Corners) -> Floats:
     """Return the side (H,) m at which squares of side 1, scaled about `origins` (H, 3) m, fit the views best.
 
-    Least squares of the distances from the rays. NaN if the views do not determine it.
+    The fit is by least squares of the distances from the rays. A side is NaN if the views do not determine it.
     """
     by_side = (squares.corners - origins[:, None])[seen.square]
     away = (seen.origin - origins[seen.square])[:, None]
@@ -162,7 +163,7 @@ def _scaled(squares: Squares, side: Floats, origins: Floats) -> Squares:
 
 
 def _finite(squares: Squares) -> Squares:
-    """Return the squares. A square without a side is replaced by a square with side 1 at the identity."""
+    """Return the squares. A square with an unknown side is replaced by a square of side 1 at the identity."""
     known = np.isfinite(squares.side)
     pose = np.where(known[:, None, None], squares.pose, np.eye(4))
     return Squares(squares.shape, pose, np.where(known, squares.side, 1.0))

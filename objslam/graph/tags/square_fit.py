@@ -20,9 +20,10 @@ _DAMPING = 1e-3
 """The first damping of Levenberg-Marquardt, as a share of the diagonal. A larger share takes smaller first steps."""
 
 _MOST_LEVERAGE = 0.9
-"""A view draws the fit towards itself, so its residuals are too small. They are corrected for this share of its influence on
-the fit (its leverage). The share is below 1, because a view that decides alone has residuals of 0, which cannot be
-corrected. A larger share widens the covariances of squares that few views show."""
+"""The share of the leverage for which the residuals of a view are corrected. A view draws the fit towards itself, so its
+residuals are too small. The leverage is the influence of the view on the fit. The share is below 1, because a view that
+decides alone has residuals of 0, which cannot be corrected. A larger share widens the covariances of squares that few views
+show."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Corners:
 
     square: (V,) index of the square. origin: (V, 3) m in map, where the rays begin. direction: (V, 4, 3) unit, in map.
     sigma: (V,) rad, the noise of one corner. whitening: (V, 8, 8) the matrix that multiplies the eight residuals of a view
-    after their division by sigma. It is the identity if the corners err independently (see `with_pose_noise`).
+    after their division by sigma. The matrix is the identity if the corners err independently (see `with_pose_noise`).
     """
 
     square: Ints
@@ -68,7 +69,7 @@ class Squares:
 
 
 def costs(seen: Corners, squares: Squares) -> Floats:
-    """Return the cost (H,) of each square: Cauchy's loss of its corners' deviations, summed."""
+    """Return the cost (H,) of each square, which is the sum of Cauchy's loss over the deviations of its corners."""
     residual, _, ahead = _residuals(seen, squares.corners)
     residual = (seen.whitening @ residual.reshape(len(seen), 8, 1)).reshape(-1, 4, 2)
     return _cost(residual, ahead, seen, len(squares.side))
@@ -77,9 +78,9 @@ def costs(seen: Corners, squares: Squares) -> Floats:
 def fit(seen: Corners, squares: Squares, free: Bools, iterations: int) -> tuple[Squares, Floats, Floats]:
     """Return the squares that fit the corners best, near the given ones, by Levenberg-Marquardt with Cauchy's loss.
 
-    free: (H,) whether the side is fitted too. Returns the squares, their costs (H,), and the information (H, 7, 7) about
-    each: rotation and position in the frame of the square, then the logarithm of the side. For a fixed side, the rows are
-    from an identity matrix.
+    free: (H,) whether the side is also fitted. Returns the squares, their costs (H,), and the information (H, 7, 7) about
+    each. The information is about rotation and position in the frame of the square, then about the logarithm of the side.
+    For a fixed side, the last row and column are those of an identity matrix.
     """
     count = len(squares.side)
     damping = np.full(count, _DAMPING)
@@ -110,8 +111,8 @@ def _moved(squares: Squares, step: Floats) -> Squares:
 
 
 def _residuals(seen: Corners, corners: Floats) -> tuple[Floats, Floats, Bools]:
-    """Return residuals (V, 4, 2) in units of `sigma`, their derivatives (V, 4, 2, 3) by the corners in map, and which (V, 4)
-    are ahead. The two axes of a residual have nearly the same directions at all four corners of a view."""
+    """Return residuals (V, 4, 2) in units of `sigma`, their derivatives (V, 4, 2, 3) by the corners in map, and which
+    corners (V, 4) are ahead. The axes of the residuals have nearly the same directions at all four corners of a view."""
     to = corners[seen.square] - seen.origin[:, None]
     along = np.einsum("vci,vci->vc", seen.direction, to)
     ahead = along > _BEHIND * np.linalg.norm(to, axis=2)
@@ -133,11 +134,12 @@ def _middle(seen: Corners) -> Floats:
 
 
 def with_pose_noise(seen: Corners, squares: Squares, angle: Floats, place: Floats) -> Corners:
-    """Return views whose cameras have noise. angle: (V,) rad, of the rotation, place: (V,) m, of the position, per axis.
+    """Return views whose cameras have noise. angle: (V,) rad, the standard deviation of the camera's rotation about each
+    axis. place: (V,) m, the standard deviation of its position along each axis.
 
-    The noise of a camera moves the four corners of its view together: the residuals have the covariance sigma^2 I + J S J^T.
-    S is the covariance of this noise. J is the derivative of the residuals by the pose of the camera, at the given squares
-    (H). So J is the same for each pose that is then compared.
+    The noise of a camera moves the four corners of its view together. So the residuals have the covariance sigma^2 I +
+    J S J^T. S is the covariance of this noise. J is the derivative of the residuals by the pose of the camera, at the given
+    squares (H). So all poses that are compared later have the same J.
     """
     _, by_point, _ = _residuals(seen, squares.corners)
     by_place = by_point.reshape(len(seen), 8, 3) * place[:, None, None]

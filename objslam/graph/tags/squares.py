@@ -16,7 +16,8 @@ def add_squares(
 ) -> list[gtsam.NonlinearFactor]:
     """Return the ties of the fiducials whose corners are all in the graph, and add their poses and sizes to the values.
 
-    landmarks: (m,) in the graph. positions: (M, 3) m of all landmarks. prior_sigma: m, of half an unknown diagonal.
+    landmarks: (m,) the landmarks in the graph. positions: (M, 3) m of all landmarks. prior_sigma: the standard deviation (m)
+    of half the diagonal of a fiducial with an unknown side.
     """
     which = tags.tied(landmarks)
     rotation, centre, side = squares_of(positions[tags.landmarks[which]], tags.shape[which])
