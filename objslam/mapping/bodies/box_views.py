@@ -21,9 +21,9 @@ from objslam.triangulation.bodies.edges import BoxEdges, contacts, tangent_plane
 class BoxViews:
     """B boxes of n bodies.
 
-    rays: the rays of the boxes, whose ranges end on surfaces. map_T_camera: (K, 4, 4) of the keyframes. body: (B,) the body
-    of each box. points: (n, 3) m, of the objects. half: (n, 2) m, their apparent half axes across and upwards. bound: (B, 4)
-    as in `BoxEdges`.
+    rays: the rays of the boxes, whose ranges end on surfaces. map_T_camera: (K, 4, 4) the poses of the cameras at the
+    keyframes. body: (B,) the body of each box. points: (n, 3) m, the points of the objects. half: (n, 2) m, the apparent
+    half axes of the objects, across and upwards. bound: (B, 4) as in `BoxEdges`.
     """
 
     keyframes: Keyframes
@@ -38,7 +38,7 @@ class BoxViews:
 
     @property
     def side(self) -> Floats:
-        """(B,) px, half the geometric mean of the sides of the image of each box."""
+        """(B,) px, half the geometric mean of the width and height of the image with each box."""
         half = np.array([np.sqrt(c.size.prod()) / 2 for c in self.cameras])
         return np.asarray(half[self.camera])
 
@@ -54,7 +54,7 @@ class BoxViews:
 
     @property
     def poses(self) -> Floats:
-        """(B, 4, 4) map_T_camera of each box."""
+        """(B, 4, 4) map_T_camera of the image with each box."""
         return self.map_T_camera[self.rays.keyframe]
 
     def take(self, boxes: Bools | Ints) -> Self:
@@ -62,8 +62,10 @@ class BoxViews:
         return replace(self, rays=self.rays.take(boxes), body=self.body[boxes], bound=self.bound[boxes])
 
     def contacts(self, touched: Floats) -> Floats:
-        """Return the points (B, 4), px, where edges touch the images of bodies. touched: (B, 4, P, 3) m, the points of the
-        bodies that may be there."""
+        """Return the positions (B, 4), px along each edge, where the edges of boxes touch the images of bodies.
+
+        touched: (B, 4, P, 3) m, the points of the bodies that each edge may touch.
+        """
         found, poses = np.zeros((len(self.body), 4)), self.poses
         for i in np.unique(self.camera):
             mine = np.flatnonzero(self.camera == i)

@@ -17,17 +17,17 @@ from objslam.mapping.bodies.cut_boxes import clipped, keyframe_of
 from objslam.mapping.solution import Solution
 
 _FARTHER = 0.25
-"""A thing cannot be in front of another if its centre is farther by more than this share of the sum of their apparent half
-axes. One end of a long thing may be behind a thing whose centre is farther: with 0 instead, a chair before the end of a desk
-was not in front from most sides. If two things only touch in the image, both have a bound there, and the sides from which
-they do not touch show their ends. With a larger share, more things are in front."""
+"""The margin by which the centre of a thing in front of another may be farther, as a share of the sum of their apparent half
+axes. One end of a long thing may be behind a thing whose centre is farther. With 0 instead, a chair before the end of a desk
+was not in front from most sides. If two things only touch in the image, each edge there is a bound for both. Other sides,
+from which they do not touch, show their ends. With a larger share, more things are in front."""
 _COVERED = 0.5
 """An edge is hidden if boxes in front cover more than this share of it. In simulated drives, 0.5 finds 98 % of the edges
-that are hidden by 12 px. A share of 0.1 finds the same 98 %, and half as many more edges that are not hidden. With a larger
-share, fewer edges are found."""
+that are hidden by 12 px. A share of 0.1 finds the same 98 %, and 50 % more edges that are not hidden. With a larger share,
+fewer edges are found."""
 _ALIKE = 2.0
-"""Two edges are the same if they differ by at most this number of standard deviations of their noise. A larger number finds
-more hidden edges, and more that are not."""
+"""The largest difference of two edges that are the same, in standard deviations of their noise. A larger number finds more
+hidden edges, and more edges that are not hidden."""
 _OFF = 0.25
 """The root mean square distance between the centre of a thing and the centre of its visible part, as a share of the visible
 size. This distance is half of the hidden length. The root mean square of the hidden length is half of the visible size. A
@@ -37,9 +37,10 @@ larger share makes positions less sure."""
 def edges_behind_boxes(
     solution: Solution, cameras: tuple[Camera, ...], settings: Settings, map_T_camera: Floats, half: Floats, ray: Ints
 ) -> Bools:
-    """Return which edges (B, 4) of the boxes of some rays (B,) may belong to a thing in front.
+    """Return which edges (B, 4) of the boxes of some rays may belong to a thing in front.
 
-    map_T_camera: (K, 4, 4) of the keyframes. half: (N,) m, the apparent half axes of the objects, NaN if unknown.
+    map_T_camera: (K, 4, 4) the poses of the cameras at the keyframes. half: (N,) m, the apparent half axes of the objects,
+    NaN if unknown. ray: (B,) the rays.
     """
     rays, association, estimate = solution.rays, solution.association, solution.estimate
     box, image, count = rays.box, rays.keyframe, len(rays)
@@ -75,7 +76,7 @@ def edges_behind_boxes(
 def with_hidden_parts(solution: Solution, cameras: tuple[Camera, ...]) -> Solution:
     """Return the solution with wider covariances of the points whose boxes are partly hidden.
 
-    The rays of such boxes all miss the object on the same side. So more rays do not make its point more exact. The
+    The rays of such boxes all miss the object on the same side. So more rays do not make the object's point more exact. The
     covariances of the centres of bodies contain this error already.
     """
     estimate, association, keyframes = solution.estimate, solution.association, solution.keyframes

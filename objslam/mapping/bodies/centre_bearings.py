@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from objslam.mapping.joint.joint_alternation import JointState
 
 _KEPT = 0.5
-"""The share of joint.min_parallax_deg that an object needs to stay in the graph. A larger share loses more objects. The
-bearings of a lost object stay as they were."""
+"""The least parallax of an object that stays in the graph, as a share of joint.min_parallax_deg. With a larger share, more
+objects are lost from the graph. The bearings of a lost object stay as they were."""
 _WORTH = 0.1
 """Poses are solved again if the median shift of an object's bearings exceeds this number of standard deviations of one
 bearing. A shift repeats in all bearings of the object. So a shift of 0.1 equals the noise of the mean of 100 bearings. A
@@ -55,7 +55,7 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
     shift = with_bodies(Solution(keyframes, rays, association, estimate, ()), state.cameras, state.settings).to_centre
     if shift is None:
         return estimate, None
-    # Of a rejected ray, the box shows another thing. The shift would turn its ray to this body, and it would agree.
+    # The box of a rejected ray shows another thing. The shift would turn the ray to this body, and the ray would then agree.
     shift = shift.only(estimate.weight > 0)
     worth = worth_turning(shift, rays.sigma, association) | worth_lengthening(shift, rays, association)
     if not worth.any():

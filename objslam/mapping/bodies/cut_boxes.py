@@ -26,24 +26,26 @@ from objslam.triangulation.bodies.shared import spread_of
 from objslam.triangulation.bodies.solve import Bodies
 
 _CHI2 = 13.28
-"""The largest squared deviation of a box from its predicted box, chi-squared of 4 degrees of freedom at 99 %. A larger value
-accepts boxes of other things."""
+"""The largest squared deviation of a box from the predicted box of its body. It is the 99 % quantile of chi-squared with 4
+degrees of freedom. A larger value accepts boxes of other things."""
 _FEWEST = 2
-"""A box is used if the body touches at least this number of its edges. The other edges are bounds: the body reaches at least
-to them. With a larger number, fewer boxes are used. One edge alone agrees with too many bodies. In simulated drives, boxes
-with one such edge made centres a little worse."""
+"""The fewest edges of a used box that the body touches. The other edges are bounds: the body reaches at least to them. One
+touched edge alone agrees with too many bodies. In simulated drives, boxes with one touched edge made centres a little worse.
+With a larger number, fewer boxes are used."""
 _WITHIN = 0.1
-"""An edge is a bound if the body touches it outside the image. It is also a bound if the body touches it inside the image,
-but at most this share of the box away from the cut. A larger share makes more edges bounds. Shares from 0 to 0.1 hardly
-differ in simulated drives."""
+"""The largest distance from the cut at which the body touches an edge that counts as a bound, as a share of the box. An edge
+that the body touches outside the image is always a bound. A larger share makes more edges bounds. Shares from 0 to 0.1
+hardly differ in simulated drives."""
 
 
 def cut_edges_of(bodies: Bodies, boxes: BoxViews, objects: Ints, solution: Solution) -> BoxEdges | None:
-    """Return the edges of the cut off boxes that belong to bodies, None if there are none.
+    """Return the edges of the cut off boxes that belong to bodies. None if there are none.
 
-    A box belongs to a body of its label under three conditions. It is near the predicted box. No other body is near the box.
-    No other box of the image is near the body or belongs to it. bodies: n bodies, of the objects (n,) in the association of
-    the solution. boxes: the whole boxes of the bodies.
+    A box belongs to a body of its label under three conditions. The box is near the predicted box of the body. The box is
+    near no other body. The image has no other box that is near the body or belongs to it.
+
+    bodies: n bodies. boxes: the whole boxes of the bodies. objects: (n,) the objects of the bodies in the association of the
+    solution.
     """
     cut = solution.rays.cut
     if cut is None or not len(cut):
@@ -90,9 +92,9 @@ def keyframe_of(cut: CutBoxes, keyframes: Keyframes) -> Ints:
 def _candidates(
     cut: CutBoxes, keyframe: Ints, bodies: Bodies, boxes: BoxViews, objects: Ints, solution: Solution
 ) -> tuple[Ints, Ints]:
-    """Return pairs of boxes and bodies of one label whose directions are near, and whose body has no whole box in the image.
+    """Return pairs (P,) of boxes and bodies of one label whose directions are near. The image has no whole box of the body.
 
-    The first array has the boxes, the second the bodies.
+    The first array has the boxes, and the second array the bodies.
     """
     association, held = solution.association, solution.association.object >= 0
     whole = distinct(solution.rays.keyframe[held] * association.count + association.object[held])
@@ -120,8 +122,8 @@ def _candidates(
 def cones(cut: CutBoxes, map_T_camera: Floats, cameras: tuple[Camera, ...]) -> tuple[Floats, Floats, Floats]:
     """Return origins (C, 3), m, axes (C, 3) in map and half angles (C,), rad, of cones around boxes.
 
-    map_T_camera: (C, 4, 4) of the image of each box. A box where the lens model has no inverse gets a cone of the whole half
-    space.
+    map_T_camera: (C, 4, 4) the pose of the camera for each box. A box where the lens model has no inverse gets a cone of the
+    whole half space.
     """
     axis, angle = np.zeros((len(cut), 3)), np.full(len(cut), np.pi / 2)
     box = cut.box
@@ -164,7 +166,8 @@ def _edges(cut: CutBoxes, keyframe: Ints, box: Ints, body: Ints, bodies: Bodies,
 
 
 def _touches_outside(views: BoxViews, touched: Floats) -> Bools:
-    """Return which edges (B, 4) a body may touch outside the image, given the points (B, 4, P, 3), m, that it may touch."""
+    """Return which edges (B, 4) a body may touch outside the image. touched: (B, 4, P, 3) m, the points that edges may
+    touch."""
     pose, box, at = views.poses, views.rays.box, views.contacts(touched)
     depth = ((touched[:, :, 0] - pose[:, None, :3, 3]) * pose[:, None, :3, 2]).sum(axis=2)
     low, high = box[:, [1, 0, 1, 0]], box[:, [3, 2, 3, 2]]  # The ends of each edge.
@@ -175,7 +178,8 @@ def _touches_outside(views: BoxViews, touched: Floats) -> Bools:
 
 
 def _deviations(edges: BoxEdges, bodies: Bodies) -> tuple[Floats, Floats]:
-    """Return by how much boxes differ from the predicted boxes of their bodies (B, 4), and which differences (B, 4) count.
+    """Return the differences (B, 4) between boxes and the predicted boxes of their bodies, and which differences (B, 4)
+    count.
 
     The differences are in standard deviations of boxes and bodies together.
     """

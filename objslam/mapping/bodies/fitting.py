@@ -26,26 +26,28 @@ from objslam.triangulation.bodies.prior import apparent_half_axes
 from objslam.triangulation.bodies.solve import Bodies, solve_bodies
 
 FEWEST = 5
-"""The least number of boxes of a body. With a larger number, more objects stay points."""
+"""The fewest boxes of an object that gets a body. With a larger number, more objects stay points."""
 _CLEAR = 1.0
-"""The least angle between the centre of a body and the centre of its box, in standard deviations of the boxes' shared error.
-Above it, the position is the centre of the body. The angle is 4 for a cabinet from close by. It is below 0.6 for things on a
-table that a noisy detector sees. With a larger value, more objects stay where their rays meet."""
+"""The angle between the centre of a body and the centre of its box, above which the position is the centre of the body. It
+is in standard deviations of the boxes' shared error. The angle is 4 for a cabinet from close by. It is below 0.6 for things
+on a table that a noisy detector sees. With a larger value, more objects stay where their rays meet."""
 _HIDDEN = 0.1
-"""If something hides a part of more than this share of an object's boxes, the position is the centre of the body. The rays
-of these boxes miss the object, all to one side. With a larger share, more objects stay where their rays meet."""
+"""The share of partly hidden boxes among all boxes of an object, above which the position is the centre of the body. The
+rays of partly hidden boxes miss the object, all to one side. With a larger share, more objects stay where their rays
+meet."""
 _UNLIKE = 0.02
-"""No thing has exactly the shape of its body, so its centre has an error that repeats from all sides. This is the least size
-of this error, as a share of half the size of the body. The centres of simulated pots, cones, seats, monitors and people were
-off by 1 to 4 % of half the height (tools/bench_shapes.py). A larger share makes all centres less sure."""
+"""The least error of a body's centre that repeats from all sides, as a share of half the size of the body. No thing has
+exactly the shape of its body. The centres of simulated pots, cones, seats, monitors and people were off by 1 to 4 % of half
+the height (tools/bench_shapes.py). A larger share makes all centres less sure."""
 
 
 def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
     """Return a solution with a body for each object whose boxes show one. The points and their covariances do not change.
 
-    The covariance of a centre contains the noise of the boxes, and the errors that they share: also the error of a thing
-    that has not exactly the shape of its body. The covariance of the point may be larger than the noise of its rays
-    explains, because solved poses have noise, or because errors of given poses last. This excess is added too.
+    The covariance of a centre contains the noise of the boxes, and the errors that the boxes share. One shared error is that
+    a thing has not exactly the shape of its body. The covariance of the point may be larger than the noise of its rays
+    explains, because solved poses have noise, or because errors of given poses last. This excess is added to the covariance
+    of the centre.
     """
     if not settings.bodies.use or up_axis(solution.keyframes) != "z":  # Bodies stand upright along z.
         return solution
@@ -97,9 +99,12 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
 
 @dataclass(frozen=True)
 class _Views:
-    """The boxes of objects with a point. objects: (n,) the objects. ray: (B,) the used rays. boxes: their boxes. border:
-    (B, 4) which edges are at the image's edge. hidden: (R,) whether a thing in front may hide an edge of the box of each
-    ray, also of objects with few boxes."""
+    """The boxes of objects with a point.
+
+    objects: (n,) the objects that may get a body. ray: (B,) the used rays. boxes: the boxes of the used rays. border: (B, 4)
+    which edges are at the image's edge. hidden: (R,) whether a thing in front may hide an edge of the box of each ray. Rays
+    of objects with few boxes count too.
+    """
 
     objects: Ints
     ray: Ints
@@ -186,9 +191,9 @@ def _noise_of_hidden(found: Bodies, boxes: BoxViews) -> Floats:
 def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Floats:
     """Return the part of each point's covariance (n, 3, 3), m^2, that the noise of its rays does not explain.
 
-    At given poses, this is `error_covariance`: the errors that were added to the covariance. The rest of the covariance is
-    no error of the body. It is wider because the rays of a large thing miss the point. It also contains a bias of Eq. 1
-    along the rays, which edges of boxes do not have.
+    At given poses, this part is `error_covariance`: the errors that were added to the covariance. The rest of the covariance
+    is no error of the body. This rest is large because the rays of a large thing miss the point. The rest also contains a
+    bias of Eq. 1 along the rays, which edges of boxes do not have.
     """
     estimate, rays, keyframes = solution.estimate, solution.rays, solution.keyframes
     if settings.mode != "joint":
@@ -209,8 +214,8 @@ def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Float
 
 
 def _body(found: Bodies, at: int, extra: Floats, flanks: Floats, *, clear: bool) -> PlacedBody:
-    """Return one body. extra: (3, 3) m^2, added to the covariance of the centre. flanks: (6, 6) m^2, as `hidden_flanks`.
-    clear: whether the object gets the centre of the body as its position."""
+    """Return the body with the index `at`. extra: (3, 3) m^2, added to the covariance of the centre. flanks: (6, 6) m^2, as
+    returned by `hidden_flanks`. clear: whether the object gets the centre of the body as its position."""
     centre, half, yaw = found.axes[at, :3], found.axes[at, 3:6], found.axes[at, 6]
     covariance = found.covariance[at] + found.unlike[at]
     covariance[:3, :3] += repeated_error(found.share[0], half) ** 2 * np.eye(3)

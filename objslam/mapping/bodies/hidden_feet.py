@@ -1,4 +1,4 @@
-"""Objects whose foot was never seen, as the other objects of their label show.
+"""Find objects whose foot was never seen, by a comparison with the other objects of their label.
 
 A lamp post behind parked cars shows only its upper half, and no box of the cars says so if a detector missed them. Its body
 then ends where the post comes into view. The other posts end at the same height, and stand on the ground. In a classroom,
@@ -16,25 +16,27 @@ from objslam.core.object_map import MapObject
 from objslam.core.statistics import NORMAL_MEDIAN
 
 _FEWEST = 4
-"""The fewest objects of a label that show how high its things are. With a larger number, fewer hidden feet are found."""
+"""The fewest objects of a label that show the height of its things. With a larger number, fewer hidden feet are found."""
 _ALIKE = 0.1
-"""The things of a label are alike if half of their tops differ from the median top by less than this share of their height.
-With a larger share, labels of different things count as well."""
+"""The largest median deviation of the tops from the median top for which the things of a label are alike. It is a share of
+the height of the things. With a larger share, labels of different things count as well."""
 _SEEN = 0.25
-"""The share of the feet that are at least seen. The foot of the things is the quantile of all feet at this share. With a
-larger share, less of hidden feet is found to be missing. With a smaller one, a single low foot counts."""
+"""The least share of the feet of a label that the boxes show. The quantile of all feet at this share counts as the foot of
+the things. With a larger share, shorter parts of hidden feet are found to be missing. With a smaller share, a single low
+foot counts."""
 _SIGMAS = 3.0
-"""A foot is higher than that of the things by more than this number of standard deviations of their tops. A larger number
+"""The least distance of a hidden foot above the foot of the things, in standard deviations of their tops. A larger number
 finds fewer hidden feet."""
 _LEAST = 0.1
-"""A foot is also higher by at least this share of the height of the things. A larger share finds fewer hidden feet."""
+"""The least distance of a hidden foot above the foot of the things, as a share of their height. A larger share finds
+fewer."""
 
 
 def with_hidden_feet(objects: tuple[MapObject, ...]) -> tuple[MapObject, ...]:
-    """Return the objects, with larger standard deviations of heights and of size where a foot may be hidden.
+    """Return the objects, with larger standard deviations of height and size where a foot may be hidden.
 
-    If things end at the same height, and the foot of one is higher than the lowest feet, its centre may be too high by half
-    of what is missing. Nobody knows whether it is another thing, so it does not move.
+    Things of one label may end at the same height. If the foot of one is then higher than the lowest feet, its centre may be
+    too high by half of the missing length. The object may also be another kind of thing, so its centre does not move.
     """
     changed = list(objects)
     for label in sorted({one.label for one in objects}):
@@ -61,8 +63,8 @@ def _heights_and_feet(objects: list[MapObject]) -> tuple[Floats, Floats, Floats]
 
 
 def _missing(height: Floats, sigma: Floats, foot: Floats) -> Floats:
-    """Return how much (n,), m, of each thing may be missing at its foot, 0 if nothing is. The arguments are as returned by
-    `_heights_and_feet`."""
+    """Return the length (n,), m, that may be missing at the foot of each thing, 0 if nothing is. The arguments are those
+    that `_heights_and_feet` returns."""
     top, low = height + foot, float(np.quantile(foot, _SEEN))
     usual = float(np.median(top))
     spread = float(np.median(np.abs(top - usual)))

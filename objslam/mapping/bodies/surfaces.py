@@ -22,23 +22,24 @@ The surfaces of rendered rings, buttons and stands with open fronts were 0.3 beh
 spread of 0.3. For simulated boxes, cylinders and balls, the two surfaces agreed to 0.07. A larger number trusts bodies
 less."""
 _UNSEEN = 0.5
-"""If a body was seen from one side only, the distance from its surface to its centre has this standard deviation, as a share
-of half the width. Such a body has only its prior. In simulated drives past things, the standard deviation was 0.4 to 0.6.
-With a larger number, bodies that were seen from few sides count more."""
+"""The standard deviation of the distance from the surface to the centre of a body that was seen from one side only. It is a
+share of half the width. Such a body has only its prior. In simulated drives past things, the standard deviation was 0.4 to
+0.6. With a larger number, bodies that were seen from few sides count more."""
 _OF_SURFACES = 0.4
-"""Ranges may end at the centre of a body (share 0) or on its surface (share 1). A solve without bodies estimates this share.
-From this value on, ranges count as ending on surfaces. In simulated drives, the share was 0.47 to 1.0 with depths of
-surfaces, and 0 to 0.31 with depths of centres. It is about `depth.centre` if a log does not show it. With a larger value,
-bodies correct the ranges of fewer logs."""
+"""The least share of the distance to the surface from which ranges count as ending on surfaces. Ranges may end at the centre
+of a body (share 0) or on its surface (share 1). The share comes from a solve without bodies. In simulated drives, it was
+0.47 to 1.0 with depths of surfaces, and 0 to 0.31 with depths of centres. It is about `depth.centre` if a log does not show
+it. With a larger value, bodies correct the ranges of fewer logs."""
 
 
 def range_shift(found: Bodies, views: BoxViews, ray: Ints, count: int, settings: Settings, common: float) -> RangeShift:
     """Return the corrections of `count` rays that make their ranges end at the centres of bodies.
 
-    Two estimates show how far the centre is behind the surface: the body, and the width of the box. They are weighted by
-    their variances, and all rays of an object have the same weights. If `depth.centre` is 0, ranges end at centres. ray:
-    (B,) the ray of each box. common: the standard deviation of the share that all things of a log have in common, 0 if this
-    share is estimated.
+    Two sources tell how far the centre is behind the surface: the body, and the width of the box. They are weighted by their
+    variances, and all rays of an object have the same weights. If `depth.centre` is 0, ranges already end at centres.
+
+    ray: (B,) the ray of each box. common: the standard deviation of the share that is common to all things of a log. It is 0
+    if the run estimates this share.
     """
     shift, edges, rays = RangeShift.none(count), views.edges(), views.rays
     half = half_widths_of_rays(rays, views.keyframes, views.cameras)
@@ -53,7 +54,7 @@ def range_shift(found: Bodies, views: BoxViews, ray: Ints, count: int, settings:
         own = grouped_median((sigma / wide)[told], edges.body[told], number)
         seen = np.maximum(own**-2 - _UNSEEN**-2, 0.0)  # What the boxes tell beyond the prior of a body.
         variance, prior = 1 / seen + _UNLIKE**2, settings.depth.centre_sigma**2 + common**2
-    weight = 1 / (1 + prior / variance)  # That of what all things have in common.
+    weight = 1 / (1 + prior / variance)  # The weight of the share that all things have in common.
     use = np.isfinite(weight)[edges.body] & (wide > 0) & np.isfinite(rays.range)
     weight, before = weight[edges.body], shares_of(rays, settings)
     # A thing is as far behind its surface as its body in this direction, where that is known.
@@ -73,9 +74,9 @@ def range_shift(found: Bodies, views: BoxViews, ray: Ints, count: int, settings:
 
 
 def _behind_surfaces(found: Bodies, edges: BoxEdges) -> tuple[Floats, Floats]:
-    """Return how far (B,), m, the centre of each body is behind its surface on the ray through its box, and the sigma (B,).
+    """Return the distance (B,), m, of each body's centre behind its surface, and the standard deviation (B,), m.
 
-    Both are NaN for a ray that misses its body, and for a point.
+    The surface is taken on the ray through the box. Both values are NaN for a ray that misses its body, and for a point.
     """
     behind, sigma = np.full(len(edges), np.nan), np.full(len(edges), np.nan)
     for kind, rows in rows_of_kinds(found.shape[edges.body]):

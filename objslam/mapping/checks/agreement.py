@@ -32,23 +32,23 @@ _WAY, _TURN = 5.0, 5.0
 _DRIFT_YAW, _DRIFT_XY = 0.015, 0.03
 """The errors (rad, m) that the odometry may have within a window. With larger values, wrong input may fit too."""
 _SIGMAS = 3.0
-"""A ray fits a point if it deviates by at most this number of standard deviations. A larger value lets false rays fit."""
+"""The largest deviation of a ray that fits a point, in standard deviations. A larger value lets false rays fit."""
 _COST = 3.0
-"""The number of boxes that a point must explain before it counts, one for each coordinate. A larger number drops points with
-few boxes."""
+"""The cost of a point in the score, as a number of fitting boxes: one box for each coordinate. With a larger number, points
+with few boxes add less to the score."""
 _AT_ONCE = 100_000
 """The most rays of several logs to which points are fitted at once. A larger number needs fewer passes and more memory."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well boxes agree. share: the share of the boxes that fit a point. score: the share with weights and costs. A box
-    that fits worse has less weight, and each point costs three boxes.
+    """How well the boxes of a log agree with points.
 
-    boxes: the number of boxes, including boxes without a ray. cut: the number of boxes that the image's edge cuts off.
-    keyframes, rays: the measurements. point: (R,) the index into
-    points of each ray, -1 for none. points: (N, 3) m. fit: (R,) how well each ray fits, 0 to 1. narrow: (R,) whether a ray
-    neither fits nor misses, because the robot saw its thing from one direction only (`Meeting.narrow`).
+    share: the share of the boxes that fit a point. score: the sum of `fit`, less three boxes for each point, as a share of
+    the boxes. boxes: the number of boxes, including boxes without a ray. cut: the number of boxes that the image's edge cuts
+    off. keyframes, rays: the measurements. point: (R,) the index of each ray's point in `points`, -1 for a ray without one.
+    points: (N, 3) m. fit: (R,) how well each ray fits, 0 to 1. narrow: (R,) whether a ray neither fits nor misses, because
+    the robot saw its thing from one direction only (`Meeting.narrow`).
     """
 
     share: float
@@ -92,7 +92,8 @@ class Part:
 
 
 def bounded_part(log: Log, settings: Settings) -> Part:
-    """Return at most `FRAMES` frames of a log. They are spread evenly, or in short windows if the poses are odometry.
+    """Return at most `FRAMES` frames of a log. The frames are spread evenly over the log. If the poses are odometry, the
+    frames are in short windows.
 
     A robot that stands shows the same view again. Of such frames, only the first counts (`standstills.repeated_views`).
     """
@@ -142,7 +143,7 @@ class _Measured:
 
 
 def agreement(part: Part, log: Log, settings: Settings) -> Agreement | None:
-    """Return how well the boxes of a log agree. `log` has the frames of the part. None if no frame has a pose."""
+    """Return how well the boxes of a log agree, or None if no frame has a pose. log: has the frames of the part."""
     return next(agreements(part, (log,), settings))
 
 
@@ -167,9 +168,12 @@ def agreements(
 def _built(
     log: Log, settings: Settings, before: tuple[Log, Keyframes, Rays, int] | None
 ) -> tuple[Log, Keyframes, Rays, int] | None:
-    """Return a log with its keyframes and rays, and the number of boxes that the image's edge cuts off. None if no frame has
-    a pose. before: what this function returned for the log before. Its rays are taken if the two logs differ only in the
-    cameras' poses on the robot."""
+    """Return a log, its keyframes, its rays, and the number of boxes that the image's edge cuts off. None if no frame has a
+    pose.
+
+    before: what this function returned for the previous log. Its rays are used again if the two logs differ only in the
+    cameras' poses on the robot.
+    """
     if before is not None and _differ_in_mounts(before[0], log):
         return log, with_mounts(before[1], log), *before[2:]
     free, ledger = settings.model_copy(update={"mode": "fixed"}), Ledger()
@@ -237,21 +241,21 @@ def _fitted(part: Part, logs: list[_Measured | None], settings: Settings) -> Ite
 
 
 def pose_noise(part: Part, settings: Settings) -> tuple[float, float]:
-    """Return the pose errors (rad, m) that a ray may have, in any direction."""
+    """Return the standard deviations of the rotation (rad) and of the position (m) of poses, in all directions together."""
     (yaw, place), (tilt, z) = _level_noise(part, settings), noise_of_ground(settings)
     return float(np.hypot(yaw, tilt)), float(np.hypot(place, z))
 
 
 def _level_noise(part: Part, settings: Settings) -> tuple[float, float]:
-    """Return the errors of headings, rad, and of x and y, m, that poses may have."""
+    """Return the standard deviations of the heading (rad) and of the place in x and y (m) of poses."""
     if part.drifts:
         return _DRIFT_YAW, _DRIFT_XY
     return settings.localization.yaw, settings.localization.xy
 
 
 def _window_length(log: Log) -> float:
-    """Return the time (s), 10 to 120, in which the odometry moves or turns as far as a window covers. It is infinite without
-    odometry."""
+    """Return the time (s) in which the odometry moves or turns as far as a window covers. The time is at least 10
+    and at most 120 s. It is infinite without odometry."""
     path = log.odometry
     if path is None or len(path) < 2:
         return np.inf
@@ -263,7 +267,7 @@ def _window_length(log: Log) -> float:
 
 
 def take_frames(one: CameraLog, kept: Bools) -> Detections:
-    """Return the detections of a camera in some of its frames. kept: (F,)."""
+    """Return the detections of a camera in some of its frames. kept: (F,) which frames to take."""
     found = one.detections
     assert found is not None
     boxes = found.take(kept[found.frame])

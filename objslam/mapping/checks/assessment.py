@@ -23,15 +23,16 @@ _MISSES = 1.5
 """A result needs a look if its residuals exceed this multiple of their expected noise. At 1.5, more than half of their
 variance is unexplained. A larger value gives fewer warnings."""
 _CUT, _CUT_NAMED = 1 / 2, 1 / 3
-"""A result needs a look if the image's edge cuts off more than the first share of the boxes: the map then does without most
-of what the detector saw. More than the second share is named. A tenth is usual in the demo's rooms, and a third in homes,
-where a robot passes things closely. Boxes that are dropped bend no map. Larger values give fewer warnings."""
+"""A result needs a look if the image's edge cuts off more than the share `_CUT` of the boxes: the map then lacks most of
+what the detector saw. From the share `_CUT_NAMED` on, the assessment names the share. A tenth is usual in the demo's rooms.
+A third is usual in homes, where a robot passes things closely. Dropped boxes bend no map. Larger values give fewer
+warnings."""
 _OFF_PATH = 1 / 3
 """A result needs a look if more than this share of the boxes have no pose of the robot. Recordings often begin before the
 localisation, and end after it. A larger value gives fewer warnings."""
 _UNEXPLAINED = 0.25
-"""A result needs a look if more than this share of the rays belong to no object or miss their object. A tenth is usual, from
-false boxes and moving things. A larger value gives fewer warnings."""
+"""A result needs a look if more than this share of the rays belong to no object or miss their object. A tenth is usual,
+because of false boxes and moving things. A larger value gives fewer warnings."""
 _LOOSE = 9.0
 """A result needs a look if the noise of the odometry is this multiple of the settings, or more. Right maps of recorded
 robots have up to 8.1. If the multiple is larger, the fault is often not in the odometry: a camera that turns on the robot
@@ -41,14 +42,14 @@ _LOOSE_POSES = 9.0
 Simulated robots with AMCL or a scan matcher have up to 5.3. Wrong maps of rows of pallets that hide each other, which bent
 an exact path, have 10 to 15. A larger value gives fewer warnings."""
 _NAMED = 3.0
-"""An assessment names the noise of the odometry if it is at least this multiple of the settings. Nine tenths of its variance
-are then not in the settings. The cause may be wheels that slip, or a path that was bent to make one object of two things.
-A larger value names it less often."""
+"""An assessment names the noise of the odometry if it is at least this multiple of the settings. The settings then explain
+only a ninth of its variance. The cause may be wheels that slip, or a path that was bent to make one object of two things. A
+larger value names the noise less often."""
 _BENT = 1.8
-"""From bearings alone, with several objects for a label, a result needs a look if the noise of the odometry is at least this
+"""A result from bearings alone, with several objects for a label, needs a look if the noise of the odometry is at least this
 multiple of the settings. Right maps of simulated robots have at most 1.7. Wrong maps of robots with a wheel that slips have
-1.9 and 3.3, and those of recorded robots 5 and more. With ranges, a right map of a recorded robot has 5.0. A larger value
-gives fewer warnings."""
+1.9 and 3.3. Wrong maps of recorded robots have 5 and more. With ranges, a right map of a recorded robot has 5.0. A larger
+value gives fewer warnings."""
 _FEW = 60
 """A result needs a look if it has fewer rays than this. The checks of the input do not judge fewer boxes. A larger value
 gives more warnings."""
@@ -66,22 +67,22 @@ views of each object remain. A larger value gives fewer warnings."""
 class Evidence:
     """The numbers that a judgement depends on.
 
-    resolved, unresolved: the numbers of objects with and without a position. boxes: the boxes of the log. cut: the boxes
-    that the image's edge cuts off. rays: the used boxes. unexplained: the used boxes without an object. rejected: the
-    used boxes that miss their object so far that they do not count. misses: the median residual as a multiple of its
-    expected noise, NaN without objects. odometry_frame: whether the map has the frame of the odometry. fixed: whether
-    the run kept the given poses. findings: the names of the faults of the input. spoilt: whether these faults make
-    positions unreliable. frames, late: the camera frames of a log or session, and the frames that a live session dropped
-    because they came too late. journal: the file with all messages of a live session, "" without one. doubted: the
-    labels that may name one object or several. unsettled: the objects that the last round of association still changed.
-    unfinished: whether the search for a clear map took all its solves (joint.max_solves).
-    copied: the objects in the largest part of the map that shows the same things as another part. several: whether a
-    label has several objects. uncalibrated: whether the estimation of the shared errors failed. odometry: the largest
-    factor on a noise of the odometry that the log shows. poses: the same for the localisation. scale: the standard
-    deviation of the scale of the odometry, as a share. None if the log shows the scale. depths: whether boxes have depths.
-    part: the limits of a log that is a part of a recording, as in `Log`.
-    malformed: the frames of boxes that were malformed. unused: the paths of the robot that could not be used.
-    off_path: the boxes without a pose of the robot or of its camera.
+    resolved, unresolved: the numbers of objects with and without a position. boxes: the number of boxes of the log. cut: the
+    number of boxes that the image's edge cuts off. rays: the number of used boxes. unexplained: the number of used boxes
+    without an object. rejected: the number of used boxes that miss their object so far that they do not count. misses: the
+    median residual as a multiple of its expected noise, NaN without objects. odometry_frame: whether the map has the frame
+    of the odometry. fixed: whether the run kept the given poses. findings: the names of the faults of the input. spoilt:
+    whether these faults make positions unreliable. frames: the number of camera frames of a log or session. late: the number
+    of frames that a live session dropped because they came too late. journal: the file with all messages of a live session,
+    "" without one. doubted: the labels that may name one object or several. unsettled: the number of objects that the last
+    round of association still changed. unfinished: whether the search for a clear map took all its solves
+    (joint.max_solves). copied: the number of objects in the largest part of the map that shows the same things as another
+    part. several: whether a label has several objects. uncalibrated: whether the estimation of the shared errors failed.
+    odometry: the largest noise of the odometry that the log shows, as a multiple of the settings. poses: the same for the
+    localisation. scale: the standard deviation of the scale of the odometry, as a share, None if the log shows the scale.
+    depths: whether boxes have depths. part: the limits of a log that is a part of a recording, as in `Log`. malformed: the
+    number of malformed frames of boxes. unused: the names of the robot's paths that could not be used. off_path: the number
+    of boxes without a pose of the robot or of its camera.
     odometry_unused: whether the mode was left to the log, and a `fixed` run did not use its odometry.
     """
 
@@ -180,7 +181,8 @@ def malformed_frames(dropped: dict[str, int]) -> int:
 def lost_input(unused: Sequence[str], malformed: int, frames: int) -> list[str]:
     """Return a sentence for each part of the input that a map lacks although the log has it.
 
-    unused: the paths of the robot that could not be used. malformed: the malformed frames of boxes, and frames: the others.
+    unused: the names of the robot's paths that could not be used. malformed, frames: the numbers of malformed and of other
+    frames of boxes.
     """
     found = [f"The map is made without {name}, which cannot be used: the warnings say why." for name in unused]
     if malformed > _MALFORMED * (malformed + frames):
@@ -190,7 +192,7 @@ def lost_input(unused: Sequence[str], malformed: int, frames: int) -> list[str]:
 
 
 def untold_scale(summary: dict[str, Any]) -> float | None:
-    """Return the standard deviation of the scale of the odometry, as a share, if the log does not show it, else None."""
+    """Return the standard deviation of the odometry's scale, as a share. None if the log shows it or no run estimated it."""
     scale = (summary.get("calibration") or {}).get("parameters", {}).get("odometry.scale")
     return None if scale is None or scale["observable"] else scale["sigma"]
 
@@ -205,8 +207,8 @@ def assess(e: Evidence) -> Assessment:
 
 
 def _about(e: Evidence) -> list[str]:
-    """Return what a reader must know of the map: a better mode, the part of the recording, the frame, the scale. No level
-    depends on it."""
+    """Return sentences about the map that do not change the level: a better mode, the part of the recording, the frame, the
+    noise of the odometry, and the scale."""
     found = []
     if e.odometry_unused:
         better = "usually more exact for objects seen from several sides"
@@ -337,7 +339,7 @@ def _depths_would_show(e: Evidence) -> str:
 
 
 def _may_be_bent(e: Evidence) -> bool:
-    """Return whether the path may be bent to a wrong association. One object for each label prevents this, or depths."""
+    """Return whether the path may be bent to fit a wrong association. Depths, or one object for each label, prevent this."""
     return e.scale is not None and e.several and _BENT <= e.odometry < _LOOSE
 
 

@@ -12,10 +12,11 @@ from objslam.errors import LogError
 from objslam.mapping.checks.finding import Finding
 
 _FEWEST = 20
-"""The fewest boxes that are judged. The test for boxes between 0 and 1 needs fewer. A few boxes may lie anywhere."""
+"""The fewest boxes that are judged, because a few boxes may lie anywhere. The test for boxes between 0 and 1 needs fewer. A
+larger number judges fewer logs."""
 _PART = 0.9
 """If more than this share of the boxes has no coordinate above 1.5, the boxes are probably shares of the image, not px. A
-smaller share also reports logs with a few wrong boxes."""
+smaller share also reports logs in which only some boxes are so small."""
 _WITHOUT_AREA = 0.2
 """If more than this share of the boxes has no area, the corners are not x1 y1 x2 y2. No detector writes such boxes. A larger
 share warns less often."""
@@ -23,17 +24,18 @@ _OUTSIDE = 0.1
 """If more than this share of the boxes has its centre outside the image, the boxes belong to a larger image. A larger share
 warns less often."""
 _LEAST_SPAN = 0.55
-"""The boxes of a long log should reach at least this share of the image's width or height. A larger share warns more
+"""The least share of the image's width or height that the boxes of a long log should reach. A larger share warns more
 often."""
 _LONG = 200
-"""A log with at least this many boxes is long, so that its boxes should cover most of the image. A larger number judges
-fewer logs."""
+"""The fewest boxes of a long log. The boxes of a long log should cover most of the image. A larger number judges fewer
+logs."""
 
 
 def refuse_shares(log: Log) -> None:
     """Raise a LogError if all boxes of a camera lie between 0 and 1: they are shares of the image.
 
-    No detector finds boxes of less than a pixel in one corner of the image. So the fault is certain, and no box is of use.
+    Boxes in px with such corners would all lie in one pixel. No detector finds them, so the fault is certain, and no box is
+    of use.
     """
     for one in log.cameras:
         found, size = one.detections, one.camera.size.astype(int).tolist()
@@ -48,7 +50,7 @@ def refuse_shares(log: Log) -> None:
 def check_boxes(log: Log, ledger: Ledger) -> list[Finding]:
     """Return the findings about the boxes of a log, from their corners alone.
 
-    ledger: from the reading of the log. It counts the boxes without area, because most readers drop these boxes.
+    ledger: the ledger of the reading of the log. The ledger counts the boxes without area, because most readers drop them.
     """
     found: list[Finding] = []
     read = [c.detections.boxes for c in log.cameras if c.detections is not None]

@@ -10,32 +10,32 @@ from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.residuals import held_rays
 
 _LEAST = 0.6
-"""The least power of the cosine for a finding. Right depths have the power 0. If depths along the optical axis are taken for
-distances along the ray, or the reverse, the power is 1 or -1. It is a little less in a joint solve, which bends the map
-towards the depths. On 11 real and simulated logs it was at most 0.05 for right depths, and 0.81 to 1.07 for wrong ones. A
-larger value finds less."""
+"""The least power of the cosine, as an absolute value, that is reported. Right depths have the power 0. The power is 1 or -1
+if depths along the optical axis are taken for distances along the ray, or the reverse. A joint solve bends the map towards
+the depths, which makes the power a little less. On 11 real and simulated logs it was at most 0.05 for right depths, and 0.81
+to 1.07 for wrong ones. A larger value reports fewer logs."""
 _SIGMAS = 5.0
-"""By how many standard deviations the power must differ from 0. With a larger number, more depths are needed."""
+"""The least difference between the power and 0, in standard deviations. With a larger number, more depths are needed."""
 _FEWEST = 30
 """The fewest depths for a check. With fewer depths, the spread of the visits is not known."""
 _VISIT = 3.0
 """The time (s) within which the errors of an object's depths count as one. With a longer time, a drive has fewer visits, and
 the power is less certain."""
 _ROUNDS = 15
-"""The number of rounds of the robust fit. It ends within a few."""
+"""The number of rounds of the robust fit. The fit settles within a few rounds."""
 _FAR = 1.5
-"""A deviation of more than this number of standard deviations counts less (Huber). A larger number trusts strays more."""
+"""The deviation above which a depth counts less (Huber), in standard deviations. A larger number trusts strays more."""
 
 
 def check_depth_axis(
     objects: ObjectMap, map_T_camera: Floats, keyframes: Keyframes, rays: Rays, association: Association
 ) -> Finding | None:
-    """Return a finding if the depths of a solved map grow or shrink like the cosine of the angle from the optical axis.
+    """Return a finding if the depths of a solved map grow or shrink with the cosine of the angle from the optical axis.
 
-    A depth image has the distance along the optical axis, a laser or a person has the distance along the ray. If one is
-    taken for the other, depths near the edge of the image are wrong by the cosine there: 13 % at 30 degrees. The fit is
-    log(range / distance) = power log(cosine) + a constant for each object. The constant takes up the scale of the map, and
-    errors that all depths of an object share.
+    A depth image holds distances along the optical axis. A laser or a person measures distances along the ray. If one is
+    taken for the other, depths near the edge of the image are wrong by the factor cosine: 13 % at 30 degrees. The fitted
+    model is log(range / distance) = power * log(cosine) + constant, with one constant for each object. The constant takes up
+    the scale of the map, and errors that all depths of an object share.
 
     map_T_camera: (K, 4, 4) the solved poses of the cameras at the keyframes.
     """
@@ -81,6 +81,6 @@ def _power(
 
 
 def _without_means(values: Floats, weight: Floats, owner: Ints) -> Floats:
-    """Return the values (H,) minus the weighted mean of their owner (H,)."""
+    """Return the values (H,), each minus the weighted mean of all values with its owner. weight, owner: (H,)."""
     mean = np.bincount(owner, weight * values) / np.maximum(np.bincount(owner, weight), 1e-12)
     return np.asarray(values - mean[owner])

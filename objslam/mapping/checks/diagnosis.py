@@ -31,36 +31,37 @@ from objslam.mapping.checks.usual_errors import without_usual_errors
 from objslam.mapping.progress import Progress
 
 _ALARM = 0.6
-"""A run tries hypotheses if the score (`Agreement.score`) at poses of a localisation is below this. With wrong input, most
-boxes may still fit, but only with several points for each thing. Each point costs a part of the score. At poses by odometry,
-each window needs its own point for each thing. So the share of fitting boxes is compared there, not the score. With a larger
+"""The score (`Agreement.score`) at poses of a localisation below which a run tries hypotheses. With wrong input, most boxes
+may still fit, but only with several points for each thing. Each point costs a part of the score. At poses by odometry, each
+window needs its own point for each thing. So the share of fitting boxes is compared there, not the score. With a larger
 value, more runs take a few seconds longer."""
 _FITTING = 0.82
-"""If the fitting boxes fit worse than this on average (`Agreement.fit`), a run tries hypotheses. Gaussian noise gives 0.9.
-With a larger value, more runs take a few seconds longer."""
+"""The mean fit (`Agreement.fit`) of the fitting boxes below which a run tries hypotheses. Gaussian noise gives 0.9. With a
+larger value, more runs take a few seconds longer."""
 _ALARM_CLOCKS = (-1.0, -0.5, 0.5, 1.0)
 """The clock offsets (s) that every run tries. A clock with a larger error also fits better with one of the offsets."""
 _CROWD = 5.0
-"""The boxes of a log with a larger crowd (`Part.crowd`) are not compared, because their rays meet anywhere and show nothing.
-With a larger value, more logs are compared, which takes longer."""
+"""The largest crowd (`Part.crowd`) of a log whose boxes are compared. In a larger crowd, rays meet anywhere and show
+nothing. With a larger value, more logs are compared, which takes longer."""
 _FEWEST = 60
-"""The boxes of a log, or of one of its halves, are judged by their agreement if there are at least this many. Fewer boxes
-agree by chance. A larger number judges fewer logs."""
+"""The fewest boxes of a log, or of one of its halves, that are judged by their agreement. Fewer boxes agree by chance. A
+larger number judges fewer logs."""
 _CLOCKS = (-0.3, -0.15, 0.15, 0.3)
 """The clock offsets (s) that are tried besides 0. The search for small errors starts from the offset that fits best. More
 offsets take longer."""
 _GAIN = 0.02
-"""The least growth of the score that shows an error: by a clock offset of `_CLOCKS`, or by the removal of the errors that
-the run does not estimate. A larger value reports fewer errors."""
+"""The least growth of the score that shows an error. The score grows by a clock offset of `_CLOCKS`, or by the removal of
+errors that the run does not estimate. A larger value reports fewer errors."""
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The faults of a log. trials: the tried hypotheses. The first trial is the unchanged log. Empty if none were tried.
+    """The faults of a log.
 
-    errors: small errors of the calibration that a run does not correct, None if there are none. jumps: of the localisation.
-    A run takes them out. None if there are none. uncompared: why the boxes were not compared with each other, "" if they
-    were.
+    findings: the faults. trials: the tried hypotheses, empty if none were tried. The first trial is the unchanged log.
+    errors: small errors of the calibration that a run does not correct, None if there are none. jumps: the jumps of the
+    localisation that a run takes out, None if there are none. uncompared: why the boxes were not compared with each other,
+    "" if they were compared.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -107,7 +108,7 @@ def diagnose(
 ) -> Diagnosis:
     """Return the diagnosis of a log. thorough: whether to try hypotheses even if all looks right.
 
-    ledger: from the reading of the log. LogError if stamps are not in s, or boxes not in px.
+    ledger: the ledger of the reading of the log. Raises a LogError if the stamps are not in s, or the boxes are not in px.
     """
     jumps = wrong_jumps(log, settings)
     found = _diagnosed(taken_out(jumps, log), settings, ledger, progress, thorough=thorough)
@@ -115,7 +116,7 @@ def diagnose(
 
 
 def _diagnosed(log: Log, settings: Settings, ledger: Ledger, progress: Progress, *, thorough: bool) -> Diagnosis:
-    """Return the diagnosis of a log without jumps. The rest is as in `diagnose`."""
+    """Return the diagnosis of a log without jumps. The arguments are as in `diagnose`."""
     if log.localization is None and log.odometry is None:
         return Diagnosis()
     refuse_shares(log)
@@ -149,8 +150,8 @@ def _diagnosed(log: Log, settings: Settings, ledger: Ledger, progress: Progress,
         doubted = bool(trials) and not part.drifts and not any(one.spoils for one in findings)
         doubted &= len(found.rays) >= _FEWEST
         none_fits = doubted and disagree(without_usual_errors(part, found, settings)[0], trials, part)
-        # Where boxes agree only by chance, they say nothing about single frames, about halves, or about how a camera is
-        # turned.
+        # If none fits, boxes agree only by chance. They then say nothing about single frames, about halves, or about how a
+        # camera is turned.
         findings += [none_fits] if none_fits else _parts_differ(part, found, settings)
         lens = None if none_fits else check_lens(part, found, settings)
         if lens is not None:
@@ -178,9 +179,10 @@ def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:
 
 
 def _corrected(part: Part, found: Agreement | None, settings: Settings) -> tuple[float, str]:
-    """Return the score of a log without small errors, and the errors, in words, that are too large for a usual camera.
+    """Return the score of a log after its small errors are removed, and the errors that are too large for a usual camera.
 
-    The small errors are the errors that a run in this mode estimates from given poses. If there are none, the score is 0.
+    The second value lists these errors in words. The small errors are those that a run in this mode estimates at given
+    poses. Without such errors, the score is 0 and the words are "".
     """
     estimated = _estimated(part, settings)
     if found is None or part.drifts or settings.mode == "joint" or not estimated:
@@ -237,7 +239,7 @@ def _parts_differ(part: Part, found: Agreement, settings: Settings) -> list[Find
 
     one = differ(found)
     if one is not None and not part.drifts:
-        # The robot does not turn equally fast in all frames. So a wrong clock, too, lets the boxes of some frames fit badly.
+        # The robot does not turn equally fast in all frames. So the boxes of some frames also fit badly if a clock is wrong.
         one = differ(without_usual_errors(part, found, settings)[0])
     if one is not None:
         return [one]
@@ -245,7 +247,7 @@ def _parts_differ(part: Part, found: Agreement, settings: Settings) -> list[Find
 
 
 def _halves_differ(found: Agreement, middle: float) -> Finding | None:
-    """Compare the halves before and after the time `middle` (s) by the rays that can fit or miss."""
+    """Return a finding if the halves before and after the time `middle` (s) differ. Only rays that can fit or miss count."""
     late = (found.keyframes.stamps[found.rays.keyframe] > middle)[~found.narrow]
     if min(late.sum(), (~late).sum()) < _FEWEST:
         return None

@@ -11,12 +11,14 @@ from objslam.mapping.checks.agreement import agreements, bounded_part
 from objslam.mapping.checks.finding import JUMPS, Finding
 
 _LOSS = 0.02
-"""The loss of score (`Agreement.score`) that shows that the jumps are right. A localisation that drifts for a while and then
-corrects itself by a jump is right before the drift and after the jump. With a larger value, more jumps are taken out."""
+"""The least loss of score (`Agreement.score`) without the jumps that shows that the jumps are right. Some localisations
+drift for a while and then correct themselves by a jump. They are right before the drift and after the jump. With a larger
+value, more jumps are taken out."""
 
 
 def wrong_jumps(log: Log, settings: Settings) -> Jumps | None:
-    """Return the jumps of a localisation, None if there are none, or if the boxes agree better at the poses as they are."""
+    """Return the jumps of a localisation that a run takes out. None if there are none, or if the boxes agree better with
+    them."""
     jumps = find_jumps(log, settings)
     if jumps is None or not any(c.detections is not None and len(c.detections.frame_stamps) for c in log.cameras):
         return jumps

@@ -14,7 +14,8 @@ from objslam.core.arrays import Bools, Floats, Ints
 
 _PAIRS = 256
 """The most tried pairs of rays for a point. More pairs find points with fewer rays, and take longer. With 96, the verdict on
-one MRCLAM robot depends on the random pairs. With 256, none of 8 seeds changes it, though scores still vary by up to 7 %."""
+one MRCLAM robot depends on the random pairs. With 256, none of 8 seeds changes the verdict, but scores still vary by up to
+7 %."""
 _JUDGES = 400
 """The most rays of a label that choose among the tried points. More rays choose better, and take longer in a crowd."""
 _FEWEST = 4
@@ -22,8 +23,8 @@ _FEWEST = 4
 _LEAST_ANGLE = np.radians(4.0)
 """The least angle between the rays of a point (rad). Rays with a smaller angle agree even if the input is wrong."""
 _NARROW = 0.9
-"""The remaining rays of a label are nearly parallel, and so neither meet nor miss, if this share of them lies within
-`_LEAST_ANGLE` of their mean direction. With a smaller share, false rays count as nearly parallel too."""
+"""The least share of nearly parallel rays of a label that lie within `_LEAST_ANGLE` of their mean direction. Nearly parallel
+rays neither meet nor miss. With a smaller share, false rays count as nearly parallel too."""
 _NEAREST = 0.25
 """The least distance (m) of a point from a camera. Rays of a turning camera meet in the camera itself. A larger distance
 loses points near a camera."""
@@ -32,23 +33,23 @@ _MOST_POINTS = 40
 _REFITS = 2
 """The number of least-squares fits to the rays of a point. More fits are more exact, and take longer."""
 _CANDIDATES = 8
-"""How many of the tried points, from the best on, may fail as seen from one direction before a label has no more points. The
-rays along a row of things all pass a far point, and the things of the row would not be found. A larger number finds points
-in longer rows, and takes longer."""
+"""The most tried points of a label, from the best on, that are examined in one round. A tried point fails if its rays come
+from one direction only. If all fail, the label has no more points. Rays along a row of things all pass a far point, which
+would hide the things of the row. A larger number finds points in longer rows, and takes longer."""
 _MANY = 100
-"""Other candidates are tried for labels with at least this number of rays left. A row of things has hundreds. Of fewer rays,
-some meet by chance, as those of a camera that somebody moved. With a smaller number, shorter rows are found."""
+"""The fewest remaining rays of a label for which a second tried point is examined. A row of things has hundreds of rays.
+Fewer rays may meet by chance, such as the rays of a camera that somebody moved. A smaller number finds shorter rows."""
 _TABLE = 1 << 17
-"""The most pairs of a tried point and a ray in one table. A larger table needs fewer passes, but leaves the processor's
-cache."""
+"""The most pairs of a tried point and a ray in one table. A larger table needs fewer passes, but does not fit into the
+processor's cache."""
 
 
 @dataclass(frozen=True)
 class Meeting:
-    """The points in which R rays meet. point: (R,) the index into points of each ray, -1 for none. points: (N, 3) m.
+    """The points in which R rays meet. point: (R,) the index of each ray's point in `points`, -1 for none. points: (N, 3) m.
 
-    fit: (R,) how well each ray fits: 1 on its point, 0 beyond its tolerance, 0 without a point. narrow: (R,) whether a ray
-    has no point because the rays of its label are nearly parallel, so that they neither meet nor miss.
+    fit: (R,) how well each ray fits its point: 1 on the point, 0 beyond the tolerance, 0 without a point. narrow: (R,)
+    whether a ray neither meets nor misses, because the remaining rays of its label are nearly parallel.
     """
 
     point: Ints
@@ -59,9 +60,9 @@ class Meeting:
 
 @dataclass(frozen=True)
 class _Rows:
-    """The rays of L labels, one label a row. number: (L, N) the index of each ray. real: (L, N), False for an empty place.
-    origins, directions: (L, N, 3) m from the middle (L, 3) of the origins. tolerance: (L, N) rad. place: m, as in
-    `fit_points`."""
+    """The rays of L labels, one label a row. number: (L, N) the index of each ray. real: (L, N) False for an empty place.
+    origins: (L, N, 3) m, relative to `middle`. directions: (L, N, 3) of unit length. tolerance: (L, N) rad. place: m, as in
+    `fit_points`. middle: (L, 3) m, the mean of the origins."""
 
     number: Ints
     real: Bools
@@ -73,7 +74,7 @@ class _Rows:
 
     @classmethod
     def of(cls, number: Ints, real: Bools, rays: tuple[Floats, Floats, Floats], place: float) -> Self:
-        """Take the rays (origins, directions, tolerance) from arrays of all rays."""
+        """Return the rows of some rays. rays: the origins, directions and tolerances of all rays."""
         origins, directions, tolerance = (each[number] for each in rays)
         middle = (origins * real[:, :, None]).sum(axis=1) / real.sum(axis=1)[:, None]
         return cls(number, real, origins - middle[:, None], directions, tolerance, place, middle)
@@ -90,12 +91,12 @@ class _Rows:
         return replace(self, **taken)
 
     def fit(self, points: Floats) -> Floats:
-        """Return how well each ray fits each point (L, P, N) of its label: 1 on the ray, 0 from the tolerance on.
+        """Return how well (L, P, N) each ray fits each point of its label: 1 on the ray, 0 from the tolerance on.
 
         points: (L, P, 3) m from the middle.
         """
         o, d = self.origins, self.directions
-        # Both are sums of products, so a product of matrices makes each in one pass over the table, which is slow to pass.
+        # `along` and `squared` are sums of products. A matrix product makes each in one pass over the table.
         squares = np.einsum("lpi,lpi->lp", points, points)[:, :, None]
         of_points = np.concatenate([points, np.ones_like(squares), squares], axis=2)
         along = of_points[:, :, :4] @ np.concatenate([d, -np.einsum("lni,lni->ln", o, d)[:, :, None]], axis=2).swapaxes(1, 2)
@@ -114,10 +115,11 @@ class _Rows:
 
 
 def fit_points(origins: Floats, directions: Floats, tolerance: Floats, place: float, label: Ints, seed: int) -> Meeting:
-    """Fit points to the rays of each label. The labels do not affect each other.
+    """Return the points in which the rays of each label meet. The labels do not affect each other.
 
-    tolerance: (R,) rad. place: m. A ray fits a point within its tolerance times the distance, plus `place`, added in
-    quadrature.
+    origins: (R, 3) m. directions: (R, 3) of unit length. tolerance: (R,) rad. place: m. A ray fits a point if it passes
+    within the tolerance times the distance, and `place`, added in quadrature. label: (R,) the label of each ray. seed: for
+    the random pairs of rays.
     """
     rng = np.random.default_rng(seed)
     rays = (origins, directions, tolerance)
@@ -145,10 +147,10 @@ def fit_points(origins: Floats, directions: Floats, tolerance: Floats, place: fl
 
 
 def nearest_point(origins: Floats, directions: Floats, start: Floats, used: Bools | None = None) -> Floats:
-    """Return the points (..., 3) that are nearest to rays (..., N, 3) in least squares of angles.
+    """Return the points (..., 3) with the least sum of squared angles to rays (..., N, 3).
 
-    start: (..., 3) points near the returned points. Their distances turn offsets into angles. used: (..., N) which rays
-    count, by default all.
+    start: (..., 3) points near the returned points. Their distances from the cameras turn offsets into angles. used:
+    (..., N) which rays count, None for all.
     """
     to = start[..., None, :] - origins
     weight = 1 / np.maximum(np.einsum("...ni,...ni->...n", to, to), _NEAREST**2)
@@ -164,7 +166,7 @@ def nearest_point(origins: Floats, directions: Floats, start: Floats, used: Bool
 def _tables(left: Ints, owner: Ints, rays: tuple[Floats, Floats, Floats], place: float) -> Iterator[_Rows]:
     """Yield the rays in tables, with one label a row. A label with too few rays is in no table.
 
-    left: (R,) the numbers of the rays, in the order of their labels. owner: (R,) the label of each.
+    left: (R,) the numbers of the rays, in the order of their labels. owner: (R,) the label of each ray.
     """
     begin = np.flatnonzero(np.diff(owner, prepend=-1))
     size = np.diff(begin, append=len(owner))
@@ -186,7 +188,8 @@ def _tried(rays: Ints) -> Ints:
 
 
 def _best_points(rows: _Rows, dice: Floats) -> tuple[Floats, Floats, Bools]:
-    """Return the best point (L, 3) of each label, how well each ray fits it (L, N), and which labels have one (L,).
+    """Return the best point (L, 3) of each label, how well each ray (L, N) fits this point, and which labels (L,) have a
+    point.
 
     dice: (2, M) random numbers from 0 to 1, M at least _PAIRS and _JUDGES. All labels use the same numbers, so no label
     affects another.
@@ -275,7 +278,7 @@ def _dots(a: Floats, b: Floats) -> Floats:
 
 
 def _seen_from_around(rows: _Rows, points: Floats, inside: Bools) -> Bools:
-    """Return which points (L, 3) have rays `inside` (L, N) at a large enough angle."""
+    """Return which points (L, 3) are seen from directions that differ enough. inside: (L, N) the rays of each point."""
     to = points[:, None] - rows.origins
     to /= np.maximum(np.linalg.norm(to, axis=2, keepdims=True), 1e-9)
     first = np.take_along_axis(to, inside.argmax(axis=1)[:, None, None], axis=1)

@@ -15,26 +15,26 @@ from objslam.core.types import Association, Keyframes, Rays
 from objslam.mapping.checks.residuals import held_rays, promised_noise
 
 _LEAST = 1.5
-"""The least misfit of an object whose rays do not agree. At 1.5, more than half of the variance of its rays is unexplained.
-A larger value finds fewer objects."""
+"""The least misfit (`Misfits.times`) of an object whose rays do not agree. At 1.5, more than half of the variance of its
+rays is unexplained. A larger value finds fewer objects."""
 _TIMES = 3.0
 """An object is odd only if its misfit is also at least this multiple of the median misfit of all objects. Association
-accepts rays of an object up to 3 times as noisy as nominal. If all rays of a log are noisy, the object is not the cause. A
-larger value finds fewer objects."""
+accepts rays that are up to 3 times as noisy as the settings say. If all rays of a log are noisy, the object is not the
+cause. A larger value finds fewer objects."""
 _SIGMAS = 3.0
 """An object is odd only if the chi-squared of its rays exceeds its expectation by this number of standard deviations. A
 larger number finds fewer objects with few rays."""
 _PLACE = 3
-"""The degrees of freedom of a position. Each ray has two."""
+"""The number of coordinates of a position. Chi-squared has two degrees of freedom for each ray, less this number."""
 
 
 @dataclass(frozen=True)
 class Misfits:
     """How well the rays of N objects agree.
 
-    times: (N,) the root of chi-squared per degree of freedom of the used rays of each object, against their expected noise.
-    NaN for an object without a position, or with a single ray. usual: the median of `times`. odd: (N,) whether the rays of
-    an object do not agree.
+    times: (N,) the misfit of each object: the root of chi-squared per degree of freedom of its used rays. Chi-squared is
+    relative to the expected noise. The misfit is NaN for an object without a position, or with a single ray. usual: the
+    median of `times`. odd: (N,) whether the rays of an object do not agree.
     """
 
     times: Floats
@@ -53,9 +53,10 @@ def find_misfits(
 ) -> Misfits:
     """Return how well the rays of each object agree.
 
-    The rays of two things that cross do not agree with one point, nor do boxes that often show only a part of their thing.
-    A ray that is far off counts as one at `CLIPPED_RAY` standard deviations. residual: (R,) rad between each ray and its
-    object. weight: (R,) 0 for a rejected ray.
+    If an object mixes two things that cross, its rays do not agree with one point. The rays of boxes that often show only a
+    part of their thing do not agree either. A ray that is farther off than `CLIPPED_RAY` standard deviations counts as one
+    at that distance. residual: (R,) the angle (rad) between each ray and its object. weight: (R,) the robust weights, 0 for
+    a rejected ray.
     """
     count, held = len(objects), held_rays(objects, association)
     times, odd = np.full(count, np.nan), np.zeros(count, dtype=bool)

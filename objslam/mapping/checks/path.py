@@ -25,8 +25,8 @@ from objslam.mapping.checks.finding import JUMPS, Finding
 from objslam.mapping.checks.parts.moving_boxes import boxes_move
 
 FASTEST = 40.0
-"""Poses are not in metres if their typical speed (m/s) is above this, the speed of a car on a motorway. A larger speed warns
-less often."""
+"""The largest typical speed (m/s) of poses in metres. It is the speed of a car on a motorway. A larger speed warns less
+often."""
 _FASTEST_TURN = 8.0
 """Headings are not in radians if the moving robot exceeds this turn rate (rad/s) in a tenth of its steps. A larger rate
 warns less often."""
@@ -55,8 +55,8 @@ _PIECES = (1, 4, 16)
 """The numbers of `_PIECE` over which distances are compared. A wrong scale shows over all of them. Noise of the places, as
 of satellite positioning, makes only short distances longer. Larger numbers suit noisier places and longer logs."""
 _LEAST_PIECE = 0.3
-"""Two distances are compared if both are at least this share of the longest distance in the same
-time. Shorter ones are noise. A larger share compares fewer distances."""
+"""Two distances are compared if both are at least this share of the longest distance in the same time. Shorter distances are
+noise. A larger share compares fewer distances."""
 _OTHER_SCALE = 0.1
 """A run warns if the logarithm of the ratio between the distances by localisation and odometry exceeds this. Real odometry
 errs by up to 8 %. A larger value warns less often."""
@@ -86,7 +86,7 @@ def check_path(log: Log, settings: Settings) -> list[Finding]:
 
 
 def _find_restarts(odometry: Trajectory, max_gap: float) -> Iterator[Finding]:
-    """Find gaps after which the odometry counts from zero again."""
+    """Yield a finding if the odometry counts from zero again after a gap. max_gap: s, the longest time that is no gap."""
     seconds = np.diff(odometry.stamps)
     gaps = np.flatnonzero(seconds > max_gap)
     restarts = gaps[counts_from_zero(odometry.poses[gaps], odometry.poses[gaps + 1])]
@@ -105,7 +105,7 @@ def _and_more(count: int) -> str:
 
 
 def _compare_steps(localization: Trajectory, odometry: Trajectory, max_gap: float) -> Iterator[Finding]:
-    """Find steps of the localisation that the odometry does not show."""
+    """Yield a finding if the localisation has steps that the odometry does not show."""
     wheels, known = interpolate(odometry.stamps, odometry.poses, localization.stamps, max_gap)
     pair = np.flatnonzero(known[:-1] & known[1:] & (np.diff(localization.stamps) <= max_gap))
     if len(pair) < FEWEST_STEPS:
@@ -132,7 +132,7 @@ def _compare_steps(localization: Trajectory, odometry: Trajectory, max_gap: floa
 
 
 def _compare_ways(localization: Trajectory, odometry: Trajectory) -> Iterator[Finding]:
-    """Compare the distances that the localisation and the odometry measure in the same pieces of time."""
+    """Yield a finding if the localisation and the odometry measure different distances in the same pieces of time."""
     begin, end = max(localization.stamps[0], odometry.stamps[0]), min(localization.stamps[-1], odometry.stamps[-1])
     times = np.arange(begin, end, _PIECE)
     if len(times) < FEWEST_STEPS:
@@ -152,8 +152,11 @@ def _compare_ways(localization: Trajectory, odometry: Trajectory) -> Iterator[Fi
 
 
 def _log_ratio(by_map: Floats, by_wheels: Floats, pieces: int) -> tuple[float, float] | None:
-    """Return the logarithm of the ratio between the distances of places (n, 3) that are `pieces` apart, and the largest that
-    may be due to errors. None if there are too few distances."""
+    """Return the logarithm of a ratio of distances, and the largest logarithm that errors may cause.
+
+    The distances are between places (n, 3), in m, that are `pieces` rows apart. The ratio is by_map to by_wheels. None if
+    there are too few distances.
+    """
     far = [np.linalg.norm(places[pieces:] - places[:-pieces], axis=1) for places in (by_map, by_wheels)]
     if len(far[0]) < FEWEST_STEPS:
         return None
@@ -208,8 +211,8 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
 def _pulses(path: Trajectory, odd: Floats, moving: Bools) -> Bools:
     """Return which steps (N-1,) differ from both steps beside them by more than a robot can accelerate and brake.
 
-    odd: (N-1,) m, the `oddness` of their moves. moving: (N-1,) the steps that show what is usual. Some localisations repeat
-    each pose until the next one is known.
+    Some localisations repeat each pose until the next one is known. odd: (N-1,) m, the `oddness` of the moves. moving:
+    (N-1,) the steps in which the robot moves. They show what is usual.
     """
     seconds = np.diff(path.stamps)
     off = np.where(seconds <= 2 * np.median(seconds), odd, 0.0)  # In a gap of the poses, a robot can do anything.
@@ -220,14 +223,14 @@ def _pulses(path: Trajectory, odd: Floats, moving: Bools) -> Bools:
 def log_is_split(way: Floats, jumps: Bools) -> bool:
     """Return whether a localisation jumps by more than 1 m, as if it changed to another map. A shorter jump is a correction.
 
-    way: (N-1,) m, by how much the steps are too long: a fast robot drives farther than 1 m without a jump. jumps: (N-1,)
-    which steps are jumps.
+    way: (N-1,) m, the excess length of each step. The whole length would not do, because a fast robot drives more than 1 m
+    in a step. jumps: (N-1,) which steps are jumps.
     """
     return bool(jumps.any() and way[jumps].max() > 1.0)
 
 
 def _judge_stops(path: Trajectory, name: str, log: Log) -> Iterator[Finding]:
-    """Find long times in which the poses stand still while the boxes move."""
+    """Yield a finding if the poses stand still for a long time while the boxes move."""
     way, angle = lengths(steps_of(path.poses)).T
     still = (way < STILL) & (angle < STILL)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
@@ -247,10 +250,9 @@ def _judge_stops(path: Trajectory, name: str, log: Log) -> Iterator[Finding]:
 
 
 def _turn_rates(path: Trajectory) -> Floats:
-    """Return the turn rate (N-1,), rad/s, that begins at each pose except the last one. It is a mean over at least
-    `_TURN_TIME`.
+    """Return the turn rate (N-1,), rad/s, from each pose except the last one. It is a mean over at least `_TURN_TIME`.
 
-    Steps are added with their directions, so the noise of headings averages out.
+    The turns are added as vectors, so the noise of headings averages out.
     """
     turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps_of(path.poses)[:, 1], axis=0)])
     first = np.arange(len(path) - 1)
@@ -260,10 +262,10 @@ def _turn_rates(path: Trajectory) -> Floats:
 
 
 def straightness(path: Trajectory) -> float | None:
-    """Return how much a robot drives along one direction of its base: 1 for wheels, near 0 for poses with wrong axes.
+    """Return how constant the direction of motion is in the robot's base: 1 for wheels, near 0 for poses with wrong axes.
 
-    It is the length of the mean direction of motion in base. Motions that are too short have no direction and do not count.
-    None if too few motions count, or if the robot hardly turns. All axes fit a robot that does not turn.
+    The value is the length of the mean direction of motion in base. Motions that are too short have no direction and do not
+    count. None if too few motions count, or if the robot hardly turns. All axes fit a robot that does not turn.
     """
     if len(path) < FEWEST_STEPS:
         return None

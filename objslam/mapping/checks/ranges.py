@@ -17,17 +17,18 @@ logs."""
 _PARALLAX = np.radians(20.0)
 """The least angle (rad) between the rays of a point for a reliable distance. A larger angle leaves fewer points."""
 _SPREAD = 0.1
-"""The largest median deviation of the points' ratios from their median, as a share. A wrong unit or scale is equal for all
-points. The ratios of points at wrong positions differ. A larger value also judges such points."""
+"""The largest median deviation of the factors of single points from their median, as a share. A factor is the ratio of range
+to distance. A wrong unit or scale gives all points one factor. Points at wrong positions have different factors. A larger
+value also judges such points."""
 _SPREAD_OF_UNITS = 0.3
-"""`_SPREAD` for a factor that only a wrong unit explains (`_UNIT`). A larger value also judges points at wrong positions."""
+"""The value of `_SPREAD` for a factor that only a wrong unit explains (`_UNIT`). A larger value also judges points at wrong
+positions."""
 _LEAST = 0.04
-"""Errors of the ranges below this share of the range are not reported. The depth of things and cameras that are turned a
-little also make such errors: up to 0.03 in simulation, and 0.02 on the MRCLAM robots with their true poses. A larger share
+"""The least error of the ranges that is reported, as a share of the range. The depth of things, and cameras that are turned
+a little, also make errors: up to 0.03 in simulation, and 0.02 on the MRCLAM robots with their true poses. A larger share
 warns less often."""
 _SPOILING = 0.06
-"""Positions are unreliable if the scale has a larger error than this share. With a larger share, fewer maps are
-unreliable."""
+"""The error of the scale from which positions are unreliable, as a share. With a larger share, fewer maps are unreliable."""
 _SIGMAS = 5.0
 """The least error of the ranges that is reported, in standard deviations. A larger number warns less often."""
 _UNITS = {1000.0: "mm", 100.0: "cm", 3.28084: "feet", 39.37: "inches", 1e-3: "km"}
@@ -35,24 +36,26 @@ _UNITS = {1000.0: "mm", 100.0: "cm", 3.28084: "feet", 39.37: "inches", 1e-3: "km
 _SCALE = "depth scale"
 """The name of a finding about ranges that are too long or too short, but not in another unit."""
 _CLOSE = 0.25
-"""A factor counts as a unit of `_UNITS` if the logarithm of their ratio is below this. A larger value names more units."""
+"""The limit on the logarithm of the ratio between a factor and a unit of `_UNITS`. Below it, the factor counts as this unit.
+A larger value names more units."""
 _UNIT = 0.7
-"""Only a wrong unit explains a factor if its logarithm exceeds this, because no calibration error is that large. A larger
+"""The logarithm of a factor above which only a wrong unit explains the factor. No calibration error is that large. A larger
 value takes fewer factors for wrong units."""
 _GROUP = 8
-"""The ranges of a label in a window show a factor if it has at least this number of boxes there. Fewer boxes show it
-poorly."""
+"""The fewest ranges of a label in a window from which a factor is estimated. Fewer ranges show it poorly. A larger number
+leaves fewer factors."""
 _ALONE = 1.1
-"""If the crowd (`Part.crowd`) is at most this, all boxes of a label in a window count as boxes of one thing. A larger value
-tests the ranges of more labels by whether they end at one point."""
+"""The largest crowd (`Part.crowd`) at which all boxes of a label in a window count as boxes of one thing. The ranges then
+are tested by whether they end at one point. A larger value tests more logs in this way."""
 _LEAST_BY_ODOMETRY = 0.18
-"""The least error of the ranges for poses by odometry. The joint mode itself corrects several percent. A larger error warns
-less often."""
+"""The least error of the ranges that is reported for poses by odometry, as a share. The joint mode itself corrects several
+percent. A larger error warns less often."""
 _FACTORS = np.exp(np.linspace(np.log(1 / 5000), np.log(5000), 1200))
 """The tried factors on ranges. More factors find the best one more exactly."""
 _TELLS = 0.5
-"""The ends of the ranges come together at the right factor. The spread there, relative to the ranges, must be below this
-share of the relative spread at the largest factor. A smaller share accepts fewer labels."""
+"""The largest spread of the ends of ranges at the right factor, as a share of their spread at the largest factor. Both
+spreads are relative to the length of the ranges. At the right factor the ends come together. A smaller share accepts fewer
+labels."""
 
 
 def check_ranges(found: Agreement, part: Part) -> Finding | None:
@@ -66,9 +69,9 @@ def check_ranges(found: Agreement, part: Part) -> Finding | None:
 
 
 def _by_spread(found: Agreement, part: Part) -> Finding | None:
-    """Judge ranges with the motion by odometry: right ranges end at one place for each label in a window.
+    """Judge ranges with the motion by odometry. Right ranges of a label in a window end at one place.
 
-    Bearings alone give poor positions in a short window.
+    Bearings alone give poor positions in a short window, so they are not used.
     """
     rays = found.rays
     origins, directions = rays.in_map(found.keyframes.map_T_camera)
@@ -97,12 +100,12 @@ def _frames(found: Agreement) -> tuple[list[int], list[int]]:
 
 
 def _best_factor(origins: Floats, directions: Floats, ranges: Floats) -> float:
-    """Return the factor on ranges (n,) for which their ends lie closest together, relative to their length. 0 if none."""
+    """Return the factor on ranges (n,) that brings their ends closest together, relative to their length. 0 if none does."""
     ends = origins + _FACTORS[:, None, None] * (ranges[:, None] * directions)
     spread = np.linalg.norm(ends - np.median(ends, axis=1, keepdims=True), axis=2)
     relative = np.median(spread, axis=1) / (_FACTORS * np.median(ranges))
     best = int(relative.argmin())
-    # At very long ranges only the directions count. If they agree, the robot stood still and no factor can be found.
+    # Only the directions count at very long ranges. If they agree, the robot stood still, and no factor can be found.
     return float(_FACTORS[best]) if relative[best] < _TELLS * relative[-1] and 0 < best < len(_FACTORS) - 1 else 0.0
 
 
@@ -152,8 +155,8 @@ def _by_bearings(found: Agreement) -> Finding | None:
 def _in_words(ratio: float, than: str, *, spoils: bool = True) -> Finding:
     """Return the finding for ranges that are `ratio` times too long, or too short if the ratio is below 1.
 
-    than: what they are compared with, in words. spoils: whether the ratio makes positions unreliable, if it is not the ratio
-    of two units.
+    than: what the ranges are compared with, in words. spoils: whether the ratio makes positions unreliable, if it is not the
+    ratio of two units.
     """
     for factor, unit in _UNITS.items():
         if abs(np.log(ratio / factor)) < _CLOSE:

@@ -21,7 +21,7 @@ _SIGMAS = 3.0
 larger number, a log must be longer before it can cause a warning."""
 _MEDIAN_SIGMA = 0.72
 """The standard deviation of the multiple from one ray: 1 / (2 p(m) m) for the density p of a Rayleigh distribution at its
-median m. From n independent rays, it is smaller by the root of n."""
+median m. For n independent rays, it is divided by the root of n."""
 
 
 def misses(
@@ -42,7 +42,8 @@ def misses(
 def promised_noise(
     objects: ObjectMap, keyframes: Keyframes, rays: Rays, association: Association, settings: Settings
 ) -> Floats:
-    """Return the standard deviations (H,), rad, of the rays whose objects are ok, seen from their cameras."""
+    """Return the expected noise (H,), rad, of the rays whose objects are ok: the standard deviation of the angle between a
+    ray and its object."""
     held = held_rays(objects, association)
     angle, place = pose_noise(rays, keyframes, settings) if settings.mode == "fixed" else (rays.sigma, 0.0)
     origins, _ = rays.in_map(keyframes.map_T_camera)

@@ -10,13 +10,13 @@ from objslam.core.noise import MOST_NOISE, MOST_POSE_NOISE, NoiseFactors
 from objslam.mapping.checks.finding import Finding
 
 MOST_SIGMAS = 3.0
-"""A shared error of more than this many standard deviations of its prior causes a warning. A larger value warns less
-often."""
+"""The most prior standard deviations by which a shared error may differ from its prior mean without a warning. A larger
+value warns less often."""
 _WIDENED, _PART = 1.5, 0.25
-"""Of some errors, the log shows only a sum. If the sum is large, their priors are widened by factors
-(`Calibration.prior_factor`). A warning follows if the largest factor exceeds `_WIDENED`. The factor is 1.5 for a sum that is
-2.3 standard deviations from its prior. The warning names an error if its variance grew by at least the share `_PART` of the
-largest growth. Larger values warn less often, and name fewer errors."""
+"""The limits of a warning about shared errors of which the log shows only the sum. If the sum is large, the priors of the
+errors are widened by factors (`Calibration.prior_factor`). A warning follows if the largest factor exceeds `_WIDENED`. The
+factor is 1.5 for a sum that is 2.3 standard deviations from its prior. The warning names an error if its variance grew by at
+least the share `_PART` of the largest growth. Larger values warn less often, and name fewer errors."""
 
 _CAUSES = {
     "clock": "do the stamps of the camera and of the poses use the same clock?",
@@ -52,9 +52,9 @@ _NOISES = {
     "place": "of the localisation's place (localization.xy)",
 }
 _NOISIER = 2.5
-"""The depths of a label are reported if their noise is more than this factor times that of all labels. With a larger number,
-fewer labels are reported. In eight simulated flats, tables reach 1.9 to 4.4 and other things 0.5 to 1.9, but for chairs of a
-map that took some of them for one (4.5)."""
+"""The least noise of a label's depths that is reported, as a multiple of the noise of all labels. With a larger number,
+fewer labels are reported. In eight simulated flats, tables reach 1.9 to 4.4, and other things 0.5 to 1.9. Chairs reach 4.5
+on one map that took several chairs for one."""
 _DEPTHS, _ODOMETRY, _POSES = ("ranges", "range_bias"), ("along", "across", "turning"), ("heading", "place")
 
 

@@ -26,11 +26,11 @@ _USUAL = {"focal": 0.05, "translation": 0.1}
 larger error."""
 _KINDS = tuple(_HARMFUL)
 _LEAST_GAIN = 40.0
-"""An error counts if it lowers the sum of the squared deviations by at least this, in units of their variance. A larger
+"""The least decrease of the sum of the squared deviations by an error that counts, in units of their variance. A larger
 value finds fewer errors."""
 _LEAST_SHARE = 0.04
-"""An error counts if it lowers the sum of the squared deviations by at least this share. Rays of a real log are not
-independent, so the sum of many small deviations proves nothing. A larger value finds fewer errors."""
+"""The least decrease of the sum of the squared deviations by an error that counts, as a share of the sum. Rays of a real log
+are not independent, so the sum of many small deviations proves nothing. A larger value finds fewer errors."""
 _UNUSUAL = 4.0
 """An error is unusual if it exceeds this number of prior standard deviations. A larger number calls fewer errors unusual."""
 _ROUNDS = 6
@@ -53,7 +53,8 @@ CAUSES = {
 
 @dataclass(frozen=True)
 class SmallErrors:
-    """Errors that explain the residuals. names, values (P,), sigma (P,): in the units of `core.calibration`.
+    """Errors that explain the residuals. names: the names of P errors. values, sigma: (P,) their values and standard
+    deviations, in the units of `core.calibration`.
 
     errors: all examined errors, as parameters of the measurements. estimated: the names of the errors that the run itself
     estimates.
@@ -84,8 +85,8 @@ class SmallErrors:
         return self._words_of(self.harmful)
 
     def unusual(self, settings: Settings) -> str:
-        """Return the errors that the run estimates, but that are far larger than their priors, with their sizes. "" if there
-        are none."""
+        """Return errors with their sizes, in words: errors that the run estimates and that are far larger than their priors.
+        "" if there are none."""
         found = zip(self.names, self.values.tolist(), strict=True)
         far = (n for n, v in found if n in self.estimated and abs(v) > _UNUSUAL * prior_sigma(n, settings, True))
         return self._words_of(tuple(far))
@@ -134,9 +135,9 @@ def shared(
 
 
 def find_small_errors(log: Log, found: Agreement, settings: Settings, noise: tuple[float, float]) -> SmallErrors | None:
-    """Return the errors that explain the residuals of the fitting rays, None if there are none.
+    """Return the errors that explain the residuals of the fitting rays. None if there are none, or too few rays.
 
-    noise: the errors of the poses (rad, m).
+    noise: the standard deviations of the poses (rad, m).
     """
     held = found.point >= 0
     if held.sum() < 10 * len(_KINDS):
@@ -172,10 +173,10 @@ def find_small_errors(log: Log, found: Agreement, settings: Settings, noise: tup
 
 
 def with_clock(errors: SmallErrors | None, offset: float, log: Log, found: Agreement, settings: Settings) -> SmallErrors:
-    """Return the errors of a log. They are `errors`, with an offset (s) added to each clock.
+    """Return the errors of a log: `errors`, with an offset (s) added to each clock.
 
-    errors: the errors of the same log with the stamps of its frames later by the offset. None if the search found none. Then
-    the clocks of the cameras are the only errors.
+    errors: the errors of a copy of the log whose frames have stamps that are later by the offset. If they are None, the
+    clocks of the cameras are the only returned errors.
     """
     own = shared(log, found.keyframes, found.rays, settings)
     values = dict.fromkeys((name for name in own.names if kind(name) == "clock"), offset)
@@ -187,7 +188,7 @@ def with_clock(errors: SmallErrors | None, offset: float, log: Log, found: Agree
 
 
 def _gain(system: PointSystem, which: list[int]) -> float:
-    """Return the decrease of the cost by the errors `which`."""
+    """Return by how much the errors `which` can lower the cost."""
     if not which:
         return 0.0
     at = np.ix_(which, which)

@@ -11,15 +11,15 @@ from objslam.mapping.checks.finding import Finding
 _OVERLAP = 0.5
 """The least share of frames within the time of the poses. A larger share also reports logs that begin late."""
 _RARE = 10.0
-"""If the median time between two poses or frames is above this, s, their stamps are probably not in s. At 10 s, a robot
-hardly measures its way. A larger value finds fewer stamps in ms, whose usual steps are 10 to 1000."""
+"""The median time (s) between two poses or frames from which their stamps are probably not in s. At 10 s, a robot hardly
+measures its way. A larger value finds fewer stamps in ms, whose usual steps are 10 to 1000."""
 _CRAWL = 0.01
-"""If a robot is slower than this, m/s, all along its path, its stamps are probably not in s. Even a lawn mower is 30 times
-as fast. A larger value accuses more robots that hardly drive."""
+"""The mean speed (m/s) of a robot below which its stamps are probably not in s. Even a lawn mower is 30 times as fast. A
+larger value accuses more robots that hardly drive."""
 
 _FASTEST = 1e-4
 """The least median time (s) between two poses, or between two frames of a camera, after a correction of the unit. If stamps
-are in s already, the correction brings them closer together than this. A larger value finds fewer wrong units."""
+in s are corrected by mistake, this time gets shorter. A larger value finds fewer wrong units."""
 
 
 def check_stamps(log: Log) -> Finding | None:
@@ -55,8 +55,10 @@ def check_stamps(log: Log) -> Finding | None:
 
 
 def _longest(log: Log) -> Trajectory | None:
-    """Return the localisation, or the odometry if the log has no localisation, or if its time includes the localisation's.
-    A localisation that begins late has no other clock."""
+    """Return the path whose stamps are tested: the localisation, or the odometry if the localisation lies within its time.
+
+    A localisation that begins late does not have another clock. None if the log has neither path.
+    """
     path, odometry = log.localization, log.odometry
     if not path or not odometry:
         return path or odometry
@@ -64,7 +66,7 @@ def _longest(log: Log) -> Trajectory | None:
 
 
 def _common_unit(path: Trajectory, frames: list[Floats]) -> str | None:
-    """Return the unit of the stamps of poses and of the frames (F,) of each camera, or None for seconds.
+    """Return the common unit of the stamps of poses and frames, None for seconds. frames: the stamps (F,) of each camera.
 
     A date in ms is larger than any date in s. If the stamps begin at zero, two other signs together show that they are not
     in s: the times between them are too long, and the robot seems to crawl.

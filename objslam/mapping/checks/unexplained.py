@@ -7,14 +7,16 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Association, Rays
 
 _USUAL = 0.12
-"""The usual share of boxes that are false or show moving objects. With a larger share, there are fewer warnings."""
+"""The usual share of boxes without an object, because they are false or show moving objects. A larger share warns less
+often."""
 _IMPLAUSIBLE = 0.4
-"""If more than this share of the boxes has no object, the input may be wrong. In simulation, right input has 0.1. Swapped
-axes, mirrored images or boxes of another image size have at least 0.5. A larger share warns less often."""
+"""The share of boxes without an object above which the input may be wrong. In simulation, right input has 0.1. Swapped axes,
+mirrored images or boxes of another image size have at least 0.5. A larger share warns less often."""
 _FITS, _ENOUGH = 0.2, 0.3
-"""If at most the share `_FITS` of the boxes of the other labels has no object, the input is probably right, and some labels
-do not fit. The other labels have at least the share `_ENOUGH` of all boxes. In a simulated classroom, 0.87 of the boxes of
-desks and 0.15 of the others had no object. A larger `_FITS`, or a smaller `_ENOUGH`, doubts the input less often."""
+"""The limits for the verdict that the input is right, but some labels do not fit. At most the share `_FITS` of the boxes of
+the other labels has no object, and these labels have at least the share `_ENOUGH` of all boxes. In a simulated classroom,
+0.87 of the boxes of desks and 0.15 of the others had no object. A larger `_FITS`, or a smaller `_ENOUGH`, doubts the input
+less often."""
 _INPUT = "the stamps, base_T_camera, the axes of the poses, and that boxes are x1 y1 x2 y2 in px of this image size"
 
 
@@ -32,7 +34,8 @@ def warn_of_unexplained(rays: Rays, association: Association, ledger: Ledger) ->
 
 
 def _cause(rays: Rays, left: Bools, number: Ints) -> str:
-    """Return why many boxes may have no object. left: (R,) which have none. number: (L,) how many of each label."""
+    """Return the probable cause if many boxes have no object. left: (R,) the boxes without one. number: (L,) their number by
+    label."""
     every = np.bincount(rays.label, minlength=len(number))
     bad = number > _IMPLAUSIBLE * every
     others = ~bad[rays.label]

@@ -23,11 +23,11 @@ _PRIORS = {"clock": 0.1, "yaw": 0.03, "tilt": 0.02, "roll": 0.02, "translation":
 """The prior standard deviations (s, rad, m, share) of usual errors: the defaults of a run in fixed mode. With larger values,
 a fault looks more like such errors."""
 _ROUNDS = 4
-"""The most times that points are fitted and errors estimated. With large errors, only some rays fit at first, and these show
-too small errors. More rounds are more exact and take longer."""
+"""The most rounds of fitting points and estimating errors. With large errors, only some rays fit at first, and the errors by
+these rays are too small. More rounds are more exact and take longer."""
 _SETTLED = 0.5
-"""Rounds end when no error changes by more than this number of its standard deviations. A smaller value is more exact and
-takes longer. The score cannot decide this, because it may grow only when nearly all rays fit."""
+"""The largest change of an error at which the rounds end, in its standard deviations. A smaller value is more exact and
+takes longer. The score cannot tell when to end, because the score may grow only when nearly all rays fit."""
 
 
 def without_usual_errors(
@@ -38,7 +38,7 @@ def without_usual_errors(
     goes_on: Callable[[Calibration], bool] = lambda found: True,
     known: Calibration | None = None,
 ) -> tuple[Agreement, Calibration | None]:
-    """Fit points and estimate the errors in turns. Return the agreement with the best score, and the last errors.
+    """Return the agreement with the best score and the last errors of rounds that fit points and estimate the errors.
 
     start: the agreement of the part as it is. prior: returns the covariance (P, P) of the errors before the estimate.
     goes_on: whether the errors of a round are worth another round. known: errors from which the first round starts, so that

@@ -13,8 +13,8 @@ from objslam.mapping.checks.meeting_points import nearest_point
 from objslam.mapping.checks.small_errors import shared
 
 _STEPS = 2
-"""The number of Gauss-Newton steps of a point. A small error hardly moves the rays, so few steps are enough. More steps are
-slower."""
+"""The number of Gauss-Newton steps that fit a point to moved rays. A small error hardly moves the rays, so few steps are
+enough. More steps are slower."""
 
 
 def say(diagnosis: Diagnosis, ledger: Ledger) -> None:

@@ -16,20 +16,22 @@ from objslam.mapping.doubts.evidence import Evidence
 _FEWEST = 5
 """The fewest boxes of a group. A larger number finds fewer groups."""
 _AROUND = 9.0
-"""The surroundings of an object end at this multiple of its gate, a squared deviation. The boxes in the surroundings show
-how many boxes lie on the object by chance. A larger multiple gives a surer estimate, from a larger area."""
+"""The limit of the surroundings of an object, as a multiple of its gate. Both are squared deviations. The number of boxes in
+the surroundings shows how many boxes lie on the object by chance. A larger multiple gives a surer estimate, from a larger
+area."""
 _SAME = 0.5
 """The least intersection over union of two boxes in one frame that show one thing. With a larger overlap, fewer boxes lie on
 an object."""
 
 
 def on_objects(evidence: Evidence, left: Ints) -> Iterator[tuple[int, Ints]]:
-    """Yield a landmark, and rays of one label that lie on it and have no object. A landmark comes once for each label.
-
-    left: (M,) the rays without an object.
+    """Yield a landmark, and the rays of one label that lie on the landmark and have no object. Several labels may lie on one
+    landmark, which is yielded once for each of them.
 
     If a landmark has a box of its own elsewhere in the image, a ray at the landmark shows a neighbour, and does not lie on
-    the landmark. If most rays of a label at a landmark show a neighbour, the other rays of the label show it too.
+    the landmark. If most rays of a label at a landmark show a neighbour, no ray of the label lies on the landmark.
+
+    left: (M,) the rays without an object.
     """
     state, gate = evidence.state, evidence.gate
     if not state.count or not len(left):

@@ -6,8 +6,8 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import binomial_tail
 
 LEAST_LOG_ODDS = np.log(1e3)
-"""The least log odds that a group is not there by chance, corrected for the number of tried places. So one log in a thousand
-shows a group by chance. A larger value finds fewer groups."""
+"""The least log odds that a group is not there by chance. They allow for the number of tried places. At this value, one log
+in a thousand shows a group by chance. A larger value finds fewer groups."""
 
 
 def crowded(inside: Ints, around: Ints, share: float, tried: int) -> Floats:
@@ -16,8 +16,9 @@ def crowded(inside: Ints, around: Ints, share: float, tried: int) -> Floats:
     Without a group, the boxes lie evenly, so the number inside is binomial. The surroundings give the density (scan
     statistic).
 
-    inside: how many lie inside, any shape. around: how many lie inside or in the surroundings. share: the share of the whole
-    region that is inside. tried: how many places were tried. With more places, a crowd by chance is more likely.
+    inside: the number of boxes in the region, an array of any shape. around: the number of boxes in the region and its
+    surroundings together. share: the size of the region, as a share of both. tried: the number of tried places. With more
+    places, a crowd by chance is more likely.
     """
     least = np.maximum(inside, 1)
     tail = binomial_tail(least, np.maximum(around - inside, 0) + least, share)

@@ -15,12 +15,11 @@ from objslam.mapping.doubts.evidence import Evidence
 _FEWEST = 3
 """The fewest rays of a group. Two rays nearly always pass closely somewhere. A larger number finds fewer groups."""
 _SCALES = (1.0, 3.0)
-"""The two largest distances of a ray from its place, in gates. With the first distance, the search finds rays that meet.
-With the second, it also finds rays that only pass nearby. Larger numbers find looser groups, and join different groups more
-often."""
+"""The largest distances of a ray from its place, in gates, in two searches. The first search finds rays that meet. The
+second also finds rays that only pass nearby. Larger numbers find looser groups, and join different groups more often."""
 _LOOSE = 2.0
-"""The second scale finds more rays than the first. If it finds more than this multiple, the rays only pass nearby, and do
-not meet. With a larger number, more loose groups count as groups that meet."""
+"""The limit on the number of rays that the second search finds, as a multiple of the number in the first. Above it, the rays
+only pass nearby and do not meet. With a larger number, more loose groups count as groups that meet."""
 _AROUND = 4.0
 """The surroundings of a place reach to this multiple of the largest distance at which a ray passes the place. A larger
 multiple gives a surer estimate of how many rays pass by chance, from a larger area."""
@@ -30,23 +29,23 @@ that pass by chance does not follow from their area. A larger angle counts place
 _PAIRS = 3000
 """The number of pairs of rays that are tried for a label. More pairs find groups of fewer rays, and take longer."""
 _NEXT = 30
-"""Half of the pairs are at most this number of boxes apart in time, because a place is seen for a while. A smaller number
-finds small groups in long logs better, with less parallax."""
+"""The largest number of boxes between the two boxes of half of the pairs. A place is seen for a while, so such pairs often
+show one place. A smaller number finds small groups in long logs better, with less parallax."""
 _PLACES, _SAMPLE = 600, 3000
-"""The most places that are tried for a label, and the most rays that count there. More find smaller groups, and take
-longer."""
+"""The most places that are tried for a label, and the most rays that are counted at these places. Larger numbers find
+smaller groups, and take longer."""
 _MOST = 12
 """The most groups of one label. Nobody reads a report with more."""
 _PARALLAX = np.radians(1.0) ** 2
 """The least squared sine of the angle between two rays whose crossing is tried. With a smaller value, more of the tried
 places are far away."""
 _FAR = 3.0
-"""A crossing counts up to this multiple of the greatest distance at which an object was seen. A larger multiple tries more
-places far away."""
+"""The greatest distance of a crossing that counts, as a multiple of the greatest distance at which an object was seen. A
+larger multiple tries more places far away."""
 
 
 def crossings(evidence: Evidence, left: Ints) -> Iterator[Ints]:
-    """Yield groups of rays that pass one place. left: (M,) the rays without an object."""
+    """Yield groups of rays. The rays of a group pass close to one place. left: (M,) the rays without an object."""
     obs, usual = evidence.state.obs, evidence.state.distance
     reach = _FAR * float(usual.max()) if len(usual) else np.inf
     order = np.argsort(obs.label[left], kind="stable")
@@ -88,7 +87,7 @@ def _of_label(evidence: Evidence, mine: Ints, reach: float) -> Iterator[Ints]:
 
 
 def _places(obs: Observations, mine: Ints, reach: float, rng: np.random.Generator) -> Floats:
-    """Return places (P, 3) where pairs of rays cross ahead of both cameras."""
+    """Return places (P, 3), m, where pairs of the rays `mine` (M,) cross ahead of both cameras, at most `reach` (m) away."""
     first = rng.integers(len(mine), size=_PAIRS)
     far = rng.integers(len(mine), size=_PAIRS)
     near = np.clip(first + rng.integers(1, _NEXT + 1, size=_PAIRS), 0, len(mine) - 1)
@@ -107,10 +106,10 @@ def _places(obs: Observations, mine: Ints, reach: float, rng: np.random.Generato
 
 
 def _deviations(obs: Observations, places: Floats, widest: float = 0.0) -> Floats:
-    """Return by how many standard deviations each ray passes each place, (P, R).
+    """Return the distance (P, R) at which each ray passes each place, in standard deviations.
 
-    It is inf for a place behind the camera, and for a place so near to the camera that the surroundings fill the view.
-    widest: the deviation up to which the surroundings reach.
+    The distance is inf for a place behind the camera, and for a place so near to the camera that the surroundings fill the
+    view. widest: the deviation up to which the surroundings reach.
     """
     centre = obs.origin.mean(axis=0)
     point, origin = places - centre, obs.origin - centre
@@ -123,8 +122,11 @@ def _deviations(obs: Observations, places: Floats, widest: float = 0.0) -> Float
 
 
 def _gathered(obs: Observations, mine: Ints, free: Bools, place: Floats, group: Bools, radius: float) -> Bools:
-    """Return which rays (M,) pass the point that fits best to a first group (M,). radius: the deviation up to which a
-    ray passes it."""
+    """Return which rays (M,) pass the point that fits best to a first group of rays.
+
+    mine: (M,) the rays. free: (M,) the rays that may be taken. place: (3,) m, where the fit starts. group: (M,) the first
+    group. radius: the largest deviation of a ray that passes the point.
+    """
     for _ in range(2):
         index = np.zeros(int(group.sum()), dtype=np.int64)
         moved = refine(obs, mine[group], index, place[None], np.ones(1))

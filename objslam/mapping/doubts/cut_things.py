@@ -20,9 +20,9 @@ _FEWEST = 5
 """The fewest frames that show a thing. A cut off box has a wide cone, and few cones meet anywhere. A larger number names
 fewer things."""
 _SEEN = 0.5
-"""A thing is named if at least this share of the frames that should show it have a box of it. Such a frame has the place of
-the thing in its image, and is about as far away as the frames with a box. A thing at rest is in most of them. The cones of a
-thing that moves meet anywhere. A larger share names fewer things."""
+"""The least share of the frames with a thing in view that have a box of the thing. With fewer boxes, the thing is not named.
+A frame has the thing in view if the image contains its place, at a distance that the frames with a box also have. A thing at
+rest is in most such images. The cones of a thing that moves meet anywhere. A larger share names fewer things."""
 _PAIRS = 1000
 """The number of pairs of boxes whose crossings are tried as the place of a thing. More pairs give a better place."""
 _PARALLAX = np.sin(np.radians(5.0)) ** 2
@@ -34,7 +34,7 @@ greatest distance, as a multiple of the greatest distance at which an object was
 _MOST = 5
 """The most things of one label. Nobody reads a list of more."""
 _SAMPLE = 2000
-"""The most boxes of a label that are looked at, evenly over the log. More take longer."""
+"""The most boxes of a label that are looked at, evenly over the log. More boxes take longer."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def _cones_of(cut: CutBoxes, frames: Keyframes, result: RunResult) -> _Cones:
 
 
 def _explained(around: _Cones, result: RunResult, name: str) -> Bools:
-    """Return which cones (C,) an object of a label reaches into. It may be unresolved: then its place is a guess."""
+    """Return which cones (C,) an object of a label reaches into. An unresolved object counts at the guess of its place."""
     known = np.zeros(len(around.frame), dtype=bool)
     for o in result.map:
         if (o.label == name or name in (o.labels or ())) and np.isfinite(o.position).all():

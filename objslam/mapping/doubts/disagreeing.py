@@ -1,4 +1,5 @@
-"""Doubts about objects that may be several things: their rays do not agree with one point, or come from two that cross."""
+"""Doubts about objects that may be several things. Their rays do not agree with one point, or the rays of two things
+cross."""
 
 from __future__ import annotations
 
@@ -13,8 +14,8 @@ from objslam.mapping.doubts.evidence import Evidence
 _NAMED = 3
 """The most objects that the assessment names. A larger number makes the assessment longer."""
 _ONE_THING = 0.5
-"""An object whose rays may cross is doubted if the probability that it is one thing is below this. With a larger value,
-fewer maps are good."""
+"""The probability of being one thing below which an object is doubted. It concerns objects at which the rays of two things
+may cross. With a larger value, fewer maps are good."""
 
 
 def misfits_of(result: RunResult) -> Misfits:
@@ -46,10 +47,12 @@ def disagreeing(result: RunResult, misfits: Misfits) -> list[Doubt]:
 
 
 def crossing(result: RunResult, evidence: Evidence) -> list[Doubt]:
-    """Return a doubt for each object that is probably not one thing at its place, the most probable first. Its rays come
-    from two sides, and two things whose rays cross explain them too. The association divides such objects only if they are
-    clearly two, because a thing that is divided may be lost. It also allows for more noise than the solved poses have. And
-    the object may be no thing at all, because frames that should show it do not (`existence`).
+    """Return a doubt for each object that is probably not one thing at its place, the most probable first.
+
+    The rays of such an object come from two sides. Two things whose rays cross at the object explain the rays too. The
+    association divides such an object only if it is clearly two, because a thing that is divided may be lost. The
+    association also allows for more noise than the solved poses have. Frames that should show the object, but do not, make
+    it less probable that the object is one thing (`existence`).
     """
     state = evidence.state
     sized = np.array([camera.sees_size for camera in result.cameras], dtype=bool)

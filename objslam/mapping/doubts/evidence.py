@@ -17,8 +17,8 @@ from objslam.core.types import Keyframes
 from objslam.graph.fixed_pose_triangulation import pose_noise
 
 _FAR = 2.0
-"""A rejected ray that misses its object by more than this many gates shows something else. Rays of the object itself, even
-with the noise of a bad box, miss it by less. A larger number finds fewer second things of a label."""
+"""The least distance, in gates, at which a rejected ray shows something else than its object. Rays of the object itself miss
+it by less, even with the noise of a bad box. A larger number finds fewer second things of a label."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,8 @@ class Evidence:
 
     state: the objects as landmarks, and the rays sorted by frame. object: (N,) the index of each landmark in the map. ray:
     (R,) the index of each observation in the result. left: (R,) whether an observation belongs to no object, or was rejected
-    and lies far from its object. covariance: (N, 3, 3) m^2. gate: the largest squared deviation of a ray from its object.
+    and lies far from its object. covariance: (N, 3, 3) m^2, of the objects' positions. gate: the largest squared deviation
+    of a ray from its object.
     """
 
     state: State
@@ -39,7 +40,7 @@ class Evidence:
 
     @cached_property
     def accepts(self) -> Bools:
-        """Whether boxes of a label may belong to a landmark, (N, L)."""
+        """(N, L) Whether boxes of each label may belong to each landmark."""
         accepts: Bools = self.state.label_count > 0
         accepts[np.arange(self.state.count), self.state.label] = True
         return accepts

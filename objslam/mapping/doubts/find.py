@@ -26,39 +26,42 @@ from objslam.mapping.moves import driven_through as passed
 from objslam.mapping.moves import other_places as moved
 
 _DOUBLE = 0.5
-"""A pair of objects counts in the assessment if it is one object with at least this probability. With a larger value, more
+"""The least probability of being one object for a pair of objects that counts in the assessment. With a larger value, more
 maps are good."""
 _DOUBTFUL = 0.4
-"""A map is bad if at least this share of its objects are likely doubles, or may be several things or at a wrong place. In
-simulation, two maps most of whose objects were wrong had 0.44 and 0.47, and right maps at most 0.15. A third wrong map,
-whose settings said that the poses are noisy, had 0.09, so a low share is no proof. Two maps with a right path and a fifth to
-a third of false objects had 0.29 and 0.34. With a larger share, fewer maps are bad."""
+"""The least share of doubtful objects in a bad map. A doubtful object is likely a double, or may be several things or at a
+wrong place. In simulation, two maps with mostly wrong objects had 0.44 and 0.47, and right maps had at most 0.15. A third
+wrong map, whose settings said that the poses are noisy, had 0.09, so a low share is no proof. Two maps with a right path and
+a fifth to a third of false objects had 0.29 and 0.34. With a larger share, fewer maps are bad."""
 _FEWEST_DOUBTFUL = 8
 """The fewest doubtful objects of a bad map. With a larger number, fewer small maps are bad."""
 _LOST = (0.1, 0.5)
-"""Two shares. A group of boxes that became no object counts in the assessment if it has at least the first share of all
-boxes of its label. It also counts if it has at least the second share of the boxes that an object of its label has (median).
-False boxes of a detector at one place are usually fewer. With larger shares, more maps are good."""
+"""The shares of boxes from which a group that became no object counts in the assessment. The group counts if it has at least
+the first share of all boxes of its label. It also counts if it has at least the second share of the median number of boxes
+of an object of its label. False boxes of a detector at one place are usually fewer. With larger shares, more maps are
+good."""
 _MARKED = 1 / 20
-"""The level of a map at a localisation does not depend on doubts about single objects if they are at most this share of its
-objects, nor on lost things if they are at most this share of the things. `doubts.json` and the report mark them. Each object
-is tested by itself, so a large right map often has one. In simulated homes, doubts name about half of the objects that are
-false or over 3 sigma off. So in a map with a tenth of such objects, about this share is doubted. With a larger share, more
-maps are good."""
+"""The largest share of doubtful things in a map at a localisation that leaves its level as it is. It is the share of the
+objects for doubts about single objects, and the share of the things for lost things. `doubts.json` and the report mark them.
+Each object is tested by itself, so a large right map often has a doubtful object. In simulated homes, doubts name about half
+of the objects that are false or over 3 sigma off. So in a map with a tenth of such objects, about this share is doubted.
+With a larger share, more maps are good."""
 _FEWEST_LOST = 5
 """The fewest boxes of a group that counts in the assessment. With a larger number, more maps are good."""
 _AT_REST = 0.5
-"""The lost things of a label without a placed object count in the assessment if they have at least this share of its boxes.
-If they have fewer, most boxes fit no place, as of another robot that sometimes stops. The assessment names such a label in
-any case. With a larger share, more maps are good."""
+"""The least share of a label's boxes in its lost things, for a label without a placed object. With a smaller share, the lost
+things do not count in the assessment: most boxes then fit no place, as those of another robot that sometimes stops. The
+assessment names such a label in any case. With a larger share, more maps are good."""
 _VIEWS = (3, np.radians(10.0))
-"""The fewest views of a lost thing that few of the frames show, and the least angle (rad) between two views. A detector
-repeats a false box while it sees a place from one view. Two false views cross somewhere, so the third view is the first that
-confirms the place. For the angle see `mapping.box_offsets.ANGLES`. With more views, more maps are good."""
+"""The fewest views of a lost thing that counts although few of the frames show it, and the least angle (rad) between two
+views. A detector repeats a false box while it sees a place from one view. Two false views cross somewhere, so the third view
+is the first that confirms the place. The angle is explained at `mapping.box_offsets.ANGLES`. With more views, more maps are
+good."""
 _PLACED: tuple[Reason, ...] = ("rare", "size", "unclear")
 """The reasons of groups whose boxes agree on one place at rest, and more closely than by chance."""
 _MOVED: tuple[Reason, ...] = ("moves",)
-"""The reasons of groups whose thing seems to move. The assessment names them, but a map may lack what moves."""
+"""The reasons of groups whose thing seems to move. The assessment names these things, but a map may lack things that
+move."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ class Doubts:
 
 
 def find_doubts(result: RunResult, evidence: Evidence) -> Doubts:
-    """Return the doubts about a result. evidence: of the result."""
+    """Return the doubts about a result. evidence: the evidence of this result."""
     return Doubts(find_pairs(evidence), find_splits(evidence), find_groups(evidence, result.settings))
 
 
@@ -80,12 +83,16 @@ def with_doubts(result: RunResult) -> RunResult:
     """Return the result with its doubts in words, and their counts by kind in the summary.
 
     A map is not called good in three cases, which may concern its whole path: some objects are more likely doubles than not,
-    a place is in the map twice, or most objects have a wide sigma. In a fourth case, it is not called good because of too
-    many things (`_are_few`): the rays of an object do not agree on one thing, an object has many sizes, the robot drove
-    through it, two objects are likely one thing that moved, or many boxes of a label meet where the map has no object. Fewer
-    of these are named. The assessment also names labels without an object, things that have only cut off boxes, and things
-    that seem to move. They do not change the level of the assessment, because their boxes may be false, and because no map
-    contains things that move. A map is bad if many objects are doubtful (`mostly_doubtful`).
+    a place is in the map twice, or most objects have a wide sigma.
+
+    A map is also not called good if too many things are doubtful (`_are_few`). A thing counts if the rays of an object do
+    not agree on one thing, if an object has many sizes, or if the robot drove through an object. It counts if two objects
+    are likely one thing that moved, or if many boxes of a label meet where the map has no object. If few things count, the
+    assessment only names them.
+
+    The assessment also names labels without an object, things that have only cut off boxes, and things that seem to move.
+    They do not change its level, because their boxes may be false, and because no map contains things that move. A map is
+    bad if many objects are doubtful (`mostly_doubtful`).
     """
     evidence = evidence_of(result)
     found = find_doubts(result, evidence)
@@ -155,9 +162,10 @@ def _of_doubtful(doubtful: int, result: RunResult) -> str:
 
 
 def _are_few(odd: int, lost: int, result: RunResult) -> bool:
-    """Return whether doubts about `odd` objects and `lost` things concern these alone, and not the map.
+    """Return whether the doubts about `odd` objects and `lost` things are too few to change the level of the map.
 
-    From odometry alone, a false object bends the path, and so it moves all other objects. At a localisation, it does not.
+    From odometry alone, they are never too few: a false object bends the path, which moves all other objects. At a
+    localisation, a false object moves no other.
     """
     known = len(result.map.resolved())
     localized = bool(result.keyframes.localized_every)
@@ -165,13 +173,13 @@ def _are_few(odd: int, lost: int, result: RunResult) -> bool:
 
 
 def _of_one_label(doubt: Doubt, result: RunResult) -> bool:
-    """Return whether the objects of a doubt have one label. A thing with another one in it or on it is no double."""
+    """Return whether all objects of a doubt have the same label. Other objects are no doubles: one may stand on the other or
+    in it."""
     return len({one.label for one in result.map.objects if one.id in doubt.objects}) == 1
 
 
 def _assessed(assessment: dict[str, Any], doubles: list[str], lost: list[str]) -> dict[str, Any]:
-    """Return the assessment with more reasons for a look at the map: what may be there twice comes first, lost things
-    last."""
+    """Return the assessment with more reasons for a look at the map. `doubles` come first, and `lost` comes last."""
     if assessment["level"] == "bad" or not (doubles or lost):
         return assessment
     if assessment["level"] == "good":  # The first reason praises the map. The others only describe it.
@@ -188,7 +196,8 @@ def _praised(assessment: dict[str, Any], odd: int, count: int) -> dict[str, Any]
 
 
 def _unnamed(found: list[Doubt], earlier: tuple[Doubt, ...]) -> list[Doubt]:
-    """Return the first of the doubts `found` about each object. Objects that `earlier` already calls two are left out."""
+    """Return the first of the doubts `found` about each object. Objects with a doubt of the kind "split" in `earlier` are
+    left out."""
     called = {one.objects for one in earlier if one.kind == "split"}
     first: dict[tuple[int, ...], Doubt] = {}
     for one in found:
@@ -228,7 +237,7 @@ def _of_lost_things(groups: BoxGroups, result: RunResult) -> list[str]:
 
 
 def _has_views(direction: Floats) -> bool:
-    """Return whether unit directions (N, 3) are of at least as many views as `_VIEWS` says."""
+    """Return whether unit directions (N, 3) contain at least the number of views in `_VIEWS`."""
     least, angle = _VIEWS
     for _ in range(least - 1):
         direction = direction[direction @ direction[0] < np.cos(angle)] if len(direction) else direction
@@ -236,7 +245,7 @@ def _has_views(direction: Floats) -> bool:
 
 
 def _of_moved_things(groups: BoxGroups, result: RunResult) -> list[str]:
-    """Return a reason for each label with a thing that seems to move, of which the map has no object."""
+    """Return a reason for each large group whose thing seems to move and is no object of the map."""
     return [
         f"{told} fit no object, and the thing near {in_place(place)} seems to move (`objslam explain`)."
         for _, told, place in _large_groups(groups, result, _MOVED)

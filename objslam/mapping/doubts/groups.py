@@ -39,17 +39,18 @@ Reason = Literal[
     "unclear",  # No single reason.
 ]
 REASONS: tuple[Reason, ...] = get_args(Reason)
-"""Why boxes became no object, in the order in which the reasons are tried. All but the first three belong to a place."""
+"""The reasons why boxes became no object, in the order in which they are tried. All but the first three belong to a
+place."""
 _OPEN = REASONS.index("unclear")  # The reason of a group before it is examined.
 _RANGE_SIGMAS = 3.0
-"""The ranges disagree if their median deviation from the place exceeds this number of standard deviations. With a larger
+"""The median deviation of ranges from the place above which the ranges disagree, in standard deviations. With a larger
 number, fewer groups have this reason."""
 _FITTED = 6
-"""A point that moves has six parameters: its place and its velocity. It explains six measured coordinates in any case. Each
-ray has two. With a larger number, fewer groups of few rays are said to move."""
+"""The number of parameters of a moving point: its place and its velocity. The point explains this number of measured
+coordinates in any case. Each ray has two. With a larger number, fewer groups of few rays are said to move."""
 _MOVES = np.log(20.0)
-"""The least log odds of a motion over rest for a group that is said to move. Boxes of a thing at rest, seen
-under little parallax, reach 2.5 if they share an error. With larger odds, fewer groups are said to move."""
+"""The least log odds of motion against rest for a group that is said to move. Boxes of a thing at rest, seen under little
+parallax, reach 2.5 if they share an error. With larger odds, fewer groups are said to move."""
 
 
 @dataclass(frozen=True)
@@ -59,13 +60,13 @@ class BoxGroups:
     ray, group: (Q,) the row of each box in the rays of the result, and its group. label: (G,) index into the label names.
     reason: (G,) index into `REASONS`. position: (G, 3) m, where their rays meet best. miss, sigma: (G,) m, the median
     distance between rays and place, and the median standard deviation of this distance along one axis. parallax: (G,) rad,
-    the widest angle between two of the rays. seen, expected: (G,) how many frames show the thing, and how many should. rate:
-    (G,) the share of such frames that show an object of the label. size, usual_size: (G,) m, of the thing, and of the
-    objects of its label, 0 if unknown. way: (G,) m, how far a moving point that explains the rays best moves. range,
-    distance: (G,) m, the median measured range, NaN without one, and the median distance to the place. odds: (G,) the log
-    odds that association gives to an object there. object: (G,) the index of the nearest object in the map, -1 for none.
-    away: (G,) m, the distance of this object from the place. double: (G,) the number of the group's boxes in frames in which
-    this object has a box of its own.
+    the widest angle between two of the rays. seen, expected: (G,) the number of frames that show the thing, and the number
+    that should show it. rate: (G,) the usual share of the frames that show an object of the label, among those that should
+    show it. size, usual_size: (G,) m, the size of the thing, and the median size of the objects of its label, 0 if unknown.
+    way: (G,) m, the way of the moving point that explains the rays best. range, distance: (G,) m, the median measured range,
+    NaN without one, and the median distance to the place. odds: (G,) the log odds that association gives to an object there.
+    object: (G,) the index of the nearest object in the map, -1 for none. away: (G,) m, the distance of this object from the
+    place. double: (G,) the number of the group's boxes in frames in which this object has a box of its own.
     """
 
     ray: Ints
@@ -131,8 +132,8 @@ def described_group(evidence: Evidence, rays: Ints, settings: Settings) -> BoxGr
 
 
 def _described(evidence: Evidence, groups: list[Ints], reason: Ints, owner: Ints, settings: Settings) -> BoxGroups:
-    """Describe groups of rays. reason: (G,) index into `REASONS`, `_OPEN` if it is not known. owner: (G,) the landmark on
-    which the boxes lie, or -1."""
+    """Return groups of rays with all their numbers. reason: (G,) index into `REASONS`, `_OPEN` if the reason is not known.
+    owner: (G,) the landmark on which the boxes lie, or -1."""
     if not groups:
         arrays: dict[str, Any] = {one.name: np.zeros((0, 3) if one.name == "position" else 0) for one in fields(BoxGroups)}
         return BoxGroups(**arrays)
@@ -199,7 +200,7 @@ def _described(evidence: Evidence, groups: list[Ints], reason: Ints, owner: Ints
 
 
 def _sights(state: State) -> Sights:
-    """Return the rays and ranges of the landmarks of a state. The noise of its ranges is right up to a factor for each
+    """Return the rays and ranges of the landmarks of a state. The noise of the ranges is right up to a factor for each
     label."""
     obs, rays = state.obs, state.assigned
     known = np.isfinite(obs.range[rays])

@@ -16,18 +16,19 @@ from objslam.mapping.doubts.points import MISSED, fit_points
 _FEWEST = 8
 """The fewest boxes of a group. A larger number finds fewer groups."""
 _BY_CHANCE = 0.1
-"""Of random boxes near a place of the image, at most this share is at the place (`robot_parts.STEADY`). A larger share finds
-fewer groups."""
+"""The largest share of the random boxes near a place of the image that are at the place (`robot_parts.STEADY`). A larger
+share finds fewer groups."""
 _TRIED = 64
-"""For each label and camera, boxes at one place of the image are counted around at most this number of boxes. A larger
-number finds smaller groups."""
+"""The most boxes of a label and camera around which the boxes at the same place of the image are counted. A larger number
+finds smaller groups."""
 _TURNED = np.cos(np.radians(20.0))
-"""The camera must turn by at least an angle with this cosine. A far thing ahead of a robot that drives straight on also
-stays at its place of the image. A smaller cosine finds fewer groups."""
+"""The cosine of the least angle by which the camera must turn. A far thing ahead of a robot that drives straight on also
+stays at its place of the image, but the camera does not turn. A smaller cosine finds fewer groups."""
 
 
 def fixed_in_image(evidence: Evidence, left: Ints) -> Iterator[Ints]:
-    """Yield groups of rays at one place of the image, which no point at rest explains. left: (M,) rays without an object."""
+    """Yield groups of rays that stay at one place of the image, if no point at rest explains them. left: (M,) the rays
+    without an object."""
     obs, view = evidence.state.obs, evidence.state.view
     key = view.camera[obs.frame[left]] * len(evidence.state.unassigned) + obs.label[left]
     order = np.argsort(key, kind="stable")

@@ -19,10 +19,10 @@ _SPEED = np.radians(25.0)
 """The highest angular speed (rad/s), seen from the camera, of a thing whose boxes follow one another. A larger value follows
 faster things, and joins more boxes by chance."""
 _LAGS = (1, 2, 3)
-"""The next box of a thing that moves comes one of these numbers of frames later. Larger numbers bridge more missed
-detections, and join more boxes by chance."""
+"""The numbers of frames after which the next box of a moving thing may come. Larger numbers bridge more missed detections,
+and join more boxes by chance."""
 _FAR_LAGS = (50, 51, 52)
-"""After these numbers of frames, two boxes no longer show the same motion. Such pairs show how often boxes follow one
+"""The numbers of frames after which two boxes no longer show the same motion. Such pairs show how often boxes follow one
 another by chance."""
 _ALIKE = 1.5
 """The largest ratio between the sizes of two boxes that follow one another. A larger ratio joins more boxes by chance."""
@@ -30,7 +30,7 @@ _SMOOTH = 0.25
 """The largest `_jitter` of a thing that moves. Noise has 1, and a smooth motion nearly 0. A larger value finds more things
 that move, and also boxes that jump about one place."""
 _SIGMAS = 3.0
-"""Two boxes that follow one another may differ from the motion by this many standard deviations of their noise. A larger
+"""The most standard deviations of noise by which two boxes that follow one another may differ from the motion. A larger
 number joins more boxes by chance."""
 
 
@@ -62,8 +62,11 @@ def moving_things(evidence: Evidence, left: Ints) -> Iterator[Ints]:
 
 
 def _jitter(evidence: Evidence, points: Points) -> Floats:
-    """Return the jitter (G,) of groups: how little the offsets of consecutive rays from their point agree. It is 1 for
-    independent offsets, and near 0 for a smooth motion (half of von Neumann's ratio, 1941, by medians)."""
+    """Return the jitter (G,) of groups: half of von Neumann's ratio (1941), by medians.
+
+    The jitter compares the steps between consecutive rays with the offsets of the rays from their point. It is 1 for
+    independent offsets, and near 0 for a smooth motion.
+    """
     obs, count = evidence.state.obs, len(points.position)
     to = points.position[points.group] - obs.origin[points.ray]
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-6)

@@ -1,4 +1,4 @@
-"""Doubts about pairs of objects whose bodies fill one space, as two things cannot."""
+"""Doubts about pairs of objects whose bodies fill one space, which two things cannot do."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ _SAME = 0.3
 """The least intersection over union of two bodies of one label that are doubted. Bodies of neighbours that are too large
 overlap by less. A larger value finds fewer doubles."""
 _OTHER = 0.5
-"""The same for two bodies of different labels. A thing may stand on another one, or in it. A larger value finds fewer things
-with two labels."""
+"""The least intersection over union of two bodies of different labels that are doubted. A thing may stand on another one, or
+in it. A larger value finds fewer things with two labels."""
 _BOTH = 2
-"""The most frames with boxes of both objects, of which a detector may show one thing twice. A larger number finds more
-doubles, and doubts more neighbours whose bodies are too large."""
+"""The most keyframes with boxes of both objects of a doubted pair. In these keyframes, a detector may show one thing twice.
+A larger number finds more doubles, and doubts more neighbours whose bodies are too large."""
 _MOST = 2000
-"""The most objects with a body whose pairs are compared. Maps with more are compared by the rays of their objects only."""
+"""The most objects with a body whose pairs are compared. In maps with more objects, only `find_pairs` compares pairs, by
+their rays."""
 
 
 def overlapping(result: RunResult, pairs: Pairs) -> list[Doubt]:
     """Return a doubt for each pair of objects whose bodies overlap, without the pairs that are doubted already.
 
-    Frames that show both say that they are two, and that their bodies are too large.
+    If several frames show both objects, they are two things whose bodies are too large. Such a pair gets no doubt.
     """
     known = {frozenset(pair) for pair in zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)}
     objects = result.map.objects

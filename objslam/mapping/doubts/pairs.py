@@ -23,27 +23,27 @@ copies. A larger value reports more pairs."""
 _LEAST = 0.1
 """The least probability that a reported pair is one object. A larger value reports fewer pairs."""
 _BOTH = 0.5
-"""Of the frames that should show both of two independent objects, this share really shows both. The others do not, because
-one thing hides another, or because a detector suppresses boxes that overlap. It is chosen, not measured. With a larger
-share, a frame without both is stronger evidence for one object."""
+"""The share of the frames that really show both of two independent objects, among the frames that should show both. In the
+others, one thing hides another, or a detector suppresses boxes that overlap. The share is chosen, not measured. With a
+larger share, a frame without both is stronger evidence for one object."""
 _BESIDES = 0.2
-"""The number of frames that show both by chance, in both explanations. It keeps the odds of few frames finite. With a larger
-number, a few frames count less."""
+"""The number of frames that show both objects by chance, whether they are one or two. It keeps the odds from few frames
+finite. With a larger number, a few frames count less."""
 _PAD = 1.0
 """The margin (m) around the objects in which other objects of their label may lie. With a larger margin, fewer pairs are
 expected to be close by chance."""
 _SHARED = 0.35
-"""Two objects fill one space if they are closer than this share of the smaller size, as in association. A larger share
-reports more pairs."""
+"""The largest distance between two objects that fill one space, as a share of the smaller size. The association has the same
+limit. A larger share reports more pairs."""
 
 
 @dataclass(frozen=True)
 class Pairs:
     """P pairs of objects that may be one, the likeliest first.
 
-    first, second: (P,) indices into the map. distance: (P,) m. sigmas: (P,) the distance in standard deviations, by both
-    covariances. probability: (P,) that they are one object. together: (P,) the number of frames with boxes of both.
-    expected: (P,) the number of frames that would show both if they were two.
+    first, second: (P,) indices into the map. distance: (P,) m. sigmas: (P,) the distance in standard deviations, by the sum
+    of both covariances. probability: (P,) the probability that the two are one object. together: (P,) the number of frames
+    with boxes of both. expected: (P,) the number of frames that would show both if they were two objects.
     """
 
     first: Ints
@@ -104,9 +104,11 @@ def _none() -> Pairs:
 
 
 def _expected(seen: Ints, expected: Ints, both: Ints, a: Ints, b: Ints) -> Floats:
-    """Return in how many frames (P,) both objects would be detected, if their detections are independent.
+    """Return the number of frames (P,) in which both objects would be detected, if their detections are independent.
 
-    both: (P,) the number of frames in view of both."""
+    seen, expected: (N,) the number of frames that show each object, and that should show it. both: (P,) the number of frames
+    with both objects in view. a, b: (P,) the objects of each pair.
+    """
     rate = seen / np.maximum(expected, 1)
     return np.asarray(both * rate[a] * rate[b])
 

@@ -14,8 +14,8 @@ from objslam.core.statistics import grouped_median
 from objslam.mapping.doubts.evidence import Evidence
 
 MISSED = 3.0
-"""The rays of a group do not meet in a point if their median deviation exceeds this number of standard deviations. The
-median deviation is 1.2 for rays that meet. With a larger number, fewer groups have rays that do not meet."""
+"""The largest median deviation of rays that meet in a point, in standard deviations. The median deviation is 1.2 for rays
+that differ from a point only by their noise. With a larger number, fewer groups have rays that do not meet."""
 _NEAR, _FAR = 0.2, 100.0
 """The least and the greatest distance (m) of the point where a fit starts. Larger values suit larger places."""
 _PAIRS = 64
@@ -41,7 +41,8 @@ class Points:
 
 
 def fit_points(evidence: Evidence, groups: list[Ints], start: Floats | None = None) -> Points:
-    """Fit a point to each group of rays. start: (G, 3) m. By default, fits start at the median crossing of pairs of rays."""
+    """Return a point for each group of rays. start: (G, 3) m, where the fits start, by default at a crossing of their
+    rays."""
     obs, count = evidence.state.obs, len(groups)
     ray = np.concatenate([*groups, np.zeros(0, dtype=np.int64)])
     group = np.repeat(np.arange(count), [len(one) for one in groups])

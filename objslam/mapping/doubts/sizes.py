@@ -16,19 +16,19 @@ objects."""
 _OTHERS = 5
 """The fewest objects from which the usual scatter is measured. A larger number judges fewer maps."""
 _TIMES = 3.0
-"""The least scatter of a doubted object, as a multiple of the median of all objects. The objects of a recorded room, with
-the boxes of a detector, have up to 2.4. Mixed objects of simulated halls have 5 and more. A larger value finds fewer."""
+"""The least scatter of a doubted object, as a multiple of the median scatter of all objects. The objects of a recorded room,
+with the boxes of a detector, have up to 2.4. Mixed objects of simulated halls have 5 and more. A larger value finds fewer
+mixed objects."""
 _LEAST = 0.2
 """The least scatter of a doubted object, in natural logarithms of its size. Right objects of simulated halls have up to
 0.13. A larger value finds fewer mixed objects."""
 
 _TURNED = np.cos(np.radians(20.0))
-"""The cosine of the largest angle between the direction of the vertical in one box and the mean of this direction over the
-boxes of the object. From above, the same thing has another height in the image than from the side: within 20 deg, the height
-of a thing without depth changes by 6 %. What its depth adds is allowed for (`_without_depth`). A larger angle judges more
-objects of cameras that are not level."""
+"""The cosine of the largest angle between the vertical in one box and the mean vertical in the boxes of the object. From
+above, a thing has another height in the image than from the side: within 20 deg, the height of a thing without depth changes
+by 6 %. `_without_depth` allows for what its depth adds. A larger angle judges more objects of cameras that are not level."""
 _DEEP = 0.9
-"""An object is at most as deep as this quantile of its widths in its boxes. A larger value finds fewer mixed objects."""
+"""The largest depth of an object is this quantile of the widths of its boxes. A larger value finds fewer mixed objects."""
 
 
 def mixed_sizes(result: RunResult) -> list[Doubt]:
@@ -37,9 +37,9 @@ def mixed_sizes(result: RunResult) -> list[Doubt]:
     A box and the distance to its object give the size of the thing in the box. The size of one thing stays the same. At
     least its height stays the same in boxes that show the vertical in the same direction, such as the boxes of a level
     camera. So only such boxes count. The scatter of the widths and the scatter of the heights are computed, and the smaller
-    one counts. It must exceed the scatter of other objects. Both must exceed the scatter that the noise of the boxes and the
-    depth of the thing explain. Boxes of two things have two sizes, also where their rays happen to meet. If a thing is put
-    too far away, its boxes grow faster than its distance falls.
+    one counts. This smaller scatter must exceed the scatter of other objects. Both scatters must exceed the scatter that the
+    noise of the boxes and the depth of the thing explain. Boxes of two things have two sizes, also where their rays happen
+    to meet. If a thing is put too far away, its boxes grow faster than its distance falls.
     """
     if len(result.map) < _OTHERS:
         return []
@@ -70,7 +70,7 @@ def _boxes(result: RunResult) -> Ints:
 
 
 def _alike(result: RunResult, mine: Ints) -> Bools:
-    """Return which of the rays (n,) show the vertical nearly as the mean of their object's rays does."""
+    """Return which of the rays (n,) show the vertical nearly in the mean direction of all rays of their object."""
     shown, owner = _shown_vertical(result, mine), result.association.object[mine]
     mean = grouped_sums(shown, owner, len(result.map))
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-9)[:, None]
@@ -78,7 +78,7 @@ def _alike(result: RunResult, mine: Ints) -> Bools:
 
 
 def _shown_vertical(result: RunResult, mine: Ints) -> Floats:
-    """Return the direction (n, 3) of the vertical in the frame of each box: across it in the image, and along its ray."""
+    """Return the vertical (n, 3) in each box: its two components in the image, and its component along the ray."""
     turn = (result.map_T_base @ result.keyframes.base_T_camera)[result.rays.keyframe[mine], :3, :3]
     vertical = np.einsum("nji,j->ni", turn, up_vector(up_axis(result.keyframes)))
     ray = np.einsum("nji,nj->ni", turn, result.directions[mine])
@@ -91,11 +91,12 @@ def _shown_vertical(result: RunResult, mine: Ints) -> Floats:
 def _without_depth(result: RunResult, mine: Ints) -> Floats:
     """Return the variances (2,) of the logarithms of the sides of an object that its depth does not explain.
 
-    A camera that looks down on a thing sees its height and a part of its depth in one side of the box: the depth times the
-    sine of the slope of the ray. The depth of a flat thing, such as a keyboard, is the larger part, and another one from
-    each direction. From where the thing looks wide, it is not deep: the sum of width and depth is the same from all
-    directions, but for a factor of at most 1.4. So this sum is fitted, with the height. An upright thing shows more height
-    than depth, and all of its variance counts.
+    A camera that looks down on a thing sees its height and a part of its depth in one side of the box. This part is the
+    depth times the sine of the slope of the ray. For a flat thing, such as a keyboard, the depth is the larger part, and it
+    differs from direction to direction. But the sum of width and depth is the same from all directions, up to a factor of
+    1.4. So this sum is fitted together with the height. An upright thing shows more height than depth, and all of its
+    variance counts.
+
     mine: (n,) the rays of the object.
     """
     away = np.linalg.norm(result.map.positions[result.association.object[mine]] - result.origins[mine], axis=1)
@@ -111,8 +112,8 @@ def _without_depth(result: RunResult, mine: Ints) -> Floats:
 
 
 def _variance(result: RunResult, mine: Ints) -> tuple[Floats, Floats]:
-    """Return the variances (N, 2) of the logarithms of the width and the height of each object, and the parts (N, 2) of them
-    that the noise of the boxes explains. mine: (n,) the rays of all objects."""
+    """Return the variances (N, 2) of the logarithms of the width and height of each object, and the variances (N, 2) that
+    the noise of the boxes explains. mine: (n,) the rays of all objects."""
     owner, count = result.association.object[mine], len(result.map)
     away = np.linalg.norm(result.map.positions[owner] - result.origins[mine], axis=1)
     size = np.log(size_per_metre(result.rays.take(mine), result.keyframes, result.cameras) * away[:, None])

@@ -53,9 +53,9 @@ class Splits:
 def find_splits(evidence: Evidence) -> Splits:
     """Return the objects that may be two.
 
-    The offsets between an object and its rays have a direction along which they scatter most. Two-means along it gives two
-    groups. The groups are two things if the distance between them is large compared with three lengths: their own scatter,
-    the noise of the rays of this label in this log, and the size of the object.
+    The offsets between an object and its rays have a direction along which they scatter most. Two-means along this direction
+    gives two groups. The groups are two things if the distance between them is large compared with three lengths: their own
+    scatter, the noise of the rays of this label in this log, and the size of the object.
     """
     state, count = evidence.state, evidence.state.count
     obs, owner, ray = state.obs, state.owner, state.assigned
@@ -87,7 +87,7 @@ def find_splits(evidence: Evidence) -> Splits:
 
 
 def _two_means(value: Floats, weight: Floats, owner: Ints, count: int) -> tuple[Bools, Floats, Floats]:
-    """Divide the values (P,) of each object in two. Return which are in the upper group (P,), and the two means (N,)."""
+    """Return which values (P,) of each object are in its upper group, and the means (N,) of its lower and upper group."""
     border = _mean(value, weight, owner, count)
     for _ in range(_ROUNDS):
         upper = value > border[owner]
@@ -102,7 +102,8 @@ def _mean(value: Floats, weight: Floats, owner: Ints, count: int) -> Floats:
 
 
 def _described(evidence: Evidence, two: Ints, upper: Bools, gap: Floats, noise: Floats) -> Splits:
-    """Describe the objects `two` (S,), indices of landmarks. upper: (P,) the group of each ray. gap, noise: (N,) m."""
+    """Return a description of the objects `two` (S,), which are indices of landmarks. upper: (P,) the group of each ray.
+    gap, noise: (N,) m."""
     state, obs = evidence.state, evidence.state.obs
     number = np.full(state.count, -1)
     number[two] = np.arange(len(two))

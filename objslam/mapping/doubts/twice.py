@@ -26,8 +26,11 @@ common. A larger share finds fewer losses."""
 
 @dataclass(frozen=True)
 class Twice:
-    """A place that is twice in a map. stamp: s, when the place was lost. first, second: the numbers of objects in both
-    parts. registration: of the first part to the second."""
+    """A place that is twice in a map.
+
+    stamp: s, when the place was lost. first, second: the numbers of objects seen before and after this time. registration:
+    the registration of the first objects to the second.
+    """
 
     stamp: float
     first: int
@@ -35,7 +38,7 @@ class Twice:
     registration: Registration
 
     def in_words(self) -> str:
-        """Return a reason of the assessment."""
+        """Return the sentence for the assessment."""
         matches = len(self.registration.matches)
         return (
             f"The {self.first} objects seen before stamp {self.stamp:.3f} and the {self.second} objects seen after it look "
@@ -68,7 +71,8 @@ def find_twice(objects: ObjectMap) -> Twice | None:
 
 
 def _cut(first: Floats, last: Floats) -> float | None:
-    """Return the time that divides objects best, None if none does. first, last: (N,) s, when each was seen."""
+    """Return the time (s) that divides the objects best. None if no time does. first, last: (N,) s, the times at which each
+    object was seen first and last."""
     times = np.unique(last)
     before = np.searchsorted(np.sort(last), times, side="right")
     after = len(first) - np.searchsorted(np.sort(first), times, side="right")

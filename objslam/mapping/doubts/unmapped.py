@@ -15,8 +15,8 @@ from objslam.mapping.doubts.groups import REASONS, described_group
 from objslam.mapping.doubts.words import in_place, why_no_object
 
 _FEWEST = 3
-"""A label without an object is named if at least this number of frames show it. With a larger number, fewer labels of false
-boxes are named, but also fewer things that were seen only for a moment."""
+"""The fewest frames that show a label without an object that is named. With a larger number, fewer labels of false boxes are
+named, but also fewer things that were seen only for a moment."""
 _NAMED = 3
 """The most labels that the assessment names. A larger number makes the assessment longer if a detector knows many labels."""
 
@@ -24,8 +24,8 @@ _NAMED = 3
 def unmapped_labels(result: RunResult, evidence: Evidence, things: Sequence[CutThing]) -> list[Doubt]:
     """Return a doubt for each label that was seen in `_FEWEST` frames, if none of its boxes belongs to an object.
 
-    Boxes that the image's edge cuts off count as seen. The label with the most boxes comes first. evidence: of the result.
-    things: the things that have only cut off boxes. A doubt names their places.
+    Boxes that the image's edge cuts off count as seen. The label in the most frames comes first. evidence: the evidence of
+    the result. things: the things that have only cut off boxes. A doubt names their places.
     """
     rays, found = result.rays, result.association.object
     labels = len(rays.label_names)

@@ -14,11 +14,11 @@ from objslam.mapping.checks.assessment import untold_scale
 _NAMED = 3
 """The most objects that the assessment names. A larger number makes the assessment longer."""
 _WIDE = 30.0
-"""If the rays of an object span at least this angle (deg), more views would hardly make its point surer. A wide sigma then
-comes from the poses or from the body. With a larger angle, more people are told to drive around the object."""
+"""The angle (deg) between rays from which more views hardly make the point of an object surer. A wide sigma then comes from
+the poses or from the body. With a larger angle, more people are told to drive around the object."""
 _BY_BODY = 0.7
-"""A sigma comes from the body if half the sigma of its size, in the same direction, is at least this share of it. With a
-larger share, fewer people are told to look at another side of the object."""
+"""The share of a sigma from which the sigma counts as coming from the body. It is compared with half the sigma of the body's
+size in the same direction. With a larger share, fewer people are told to look at another side of the object."""
 _MOST = 0.5
 """A map is good only if at most this share of its objects with a position is unsure. With a larger share, more maps are
 good."""
@@ -27,9 +27,9 @@ good."""
 def unsure_objects(result: RunResult) -> list[Doubt]:
     """Return a doubt for each object with a position whose sigma exceeds `triangulation.sure_sigma`, the least sure first.
 
-    The error that all objects share does not count: it moves the map, and a robot in it, as a whole. In the frame of the
-    odometry, so does a scale of the odometry that the log does not show. The covariance of the shared error contains only a
-    part of it if the path bends with it.
+    The error that all objects share does not count, because it moves the whole map together with a robot in it. In the frame
+    of the odometry, a scale of the odometry that the log does not show does the same. If the path bends with the scale, the
+    covariance of the shared error contains only a part of the scale.
     """
     known = [o for o in result.map if o.covariance is not None and o.status == "ok"]
     if not known:
@@ -70,8 +70,8 @@ def _in_odometry_frame(result: RunResult) -> bool:
 
 
 def _why(o: MapObject, sigma: float, direction: Floats, by_odometry: bool) -> str:
-    """Return the cause of a wide sigma (m), and what to do. direction: (3,) unit, of the sigma. by_odometry: whether the map
-    lies in the frame of the odometry."""
+    """Return the cause of a wide sigma (m), and what to do. direction: (3,) the unit direction of the sigma. by_odometry:
+    whether the map lies in the frame of the odometry."""
     if o.body is not None and _sigma_by_size(o.body, direction) >= _BY_BODY * sigma:
         return (
             "its boxes do not show how far it goes on in this direction. Drive to where another side of it shows, or set "

@@ -15,32 +15,32 @@ from objslam.mapping.doubts.groups import REASONS, BoxGroups
 from objslam.mapping.doubts.pairs import Pairs
 from objslam.mapping.doubts.splits import Splits
 
-_CLOSE = np.log(20.0)  # Log odds below this are called close. With larger odds, more are.
+_CLOSE = np.log(20.0)  # Log odds below this are called close. A larger value calls more odds close.
 _SURE = 1000
-"""Larger odds are said to be more than this, because the model of the boxes is not exact enough for a number. With a larger
-number, more odds are named."""
+"""The largest odds that are said as a number. Larger odds are said to be more than this, because the model of the boxes is
+not exact enough. With a larger number, more odds are said exactly."""
 _DISAGREE = 2.0
-"""The rays of an object disagree if they pass it at more than this multiple of their noise (root mean square). With a larger
-number, fewer objects are said to have rays that disagree."""
+"""The least distance (root mean square) of rays from an object with which they disagree, as a multiple of their noise. With
+a larger number, fewer objects are said to have rays that disagree."""
 _SPAN = (0.1, 0.9)
-"""The quantiles of the stamps of an object's boxes that say when it was seen. Single boxes of other things do not count. A
-wider span finds fewer pairs whose boxes follow one another in time."""
+"""The quantiles of the stamps of an object's boxes between which the object was seen. They leave out single boxes of other
+things. A wider span finds fewer pairs whose boxes follow one another in time."""
 _MOVED = 1.0
-"""A pair may be one thing that moved if its places differ by at least this number of sigmas. Nearer places are
-one place. With a larger number, fewer pairs are said to be things that moved."""
+"""The least distance, in sigmas, between the places of a pair that may be one thing that moved. With a larger number, fewer
+pairs are said to be things that moved."""
 _BESIDE = 0.5
-"""A sentence names the nearest object up to this distance (m), if the object has the label of the boxes. An object of
-another label is named within its own size. A larger distance names more objects."""
+"""The largest distance (m) at which a sentence names the nearest object, if the object has the label of the boxes. An object
+of another label is named within half its size. A larger distance names more objects."""
 
 
 def in_words(result: RunResult, pairs: Pairs, splits: Splits, groups: BoxGroups) -> tuple[Doubt, ...]:
-    """Return all doubts in words. Of each kind, the likeliest pairs and the groups with the most boxes come first."""
+    """Return all doubts in words. Pairs are sorted by probability, and groups by their number of boxes."""
     unresolved = (_unresolved(result, j) for j, o in enumerate(result.map.objects) if o.status != "ok")
     return (*_pairs(result, pairs), *_splits(result, splits), *unresolved, *_groups(result, groups))
 
 
 def why_unresolved(result: RunResult, j: int) -> str:
-    """Return why an object j has no position, with the limit from the settings."""
+    """Return why the object with the index j has no position, with the limit from the settings."""
     o, limits = result.map.objects[j], result.settings.triangulation
     if o.rays < 2:
         return "a single ray gives a direction and no distance"
@@ -55,8 +55,11 @@ def why_unresolved(result: RunResult, j: int) -> str:
 
 
 def _noise_deg(result: RunResult, j: int) -> float:
-    """Return the median standard deviation of the rays of an object, deg. At given poses, it includes the noise of the
-    headings, and that of the places if the object has a position."""
+    """Return the median standard deviation (deg) of the rays of an object.
+
+    At given poses, it includes the noise of the headings. If the object has a position, it also includes the noise of the
+    robot's places.
+    """
     mine = np.flatnonzero(result.association.object == j)
     sigma = result.rays.sigma[mine]
     if result.settings.mode == "fixed":
@@ -179,8 +182,8 @@ def _is_beside(o: MapObject, label: str, away: float) -> bool:
 
 
 def why_no_object(result: RunResult, groups: BoxGroups, g: int, rays: Ints) -> str:
-    """Return the end of the sentence about a group: why its boxes are no object. rays: its rows in the rays of the
-    result."""
+    """Return the end of the sentence about group g: why its boxes are no object. rays: (n,) the rows of the group's boxes in
+    the rays of the result."""
     label = result.rays.label_names[groups.label[g]]
     miss, sigmas = _length(groups.miss[g]), _length(3 * groups.sigma[g])
     match REASONS[groups.reason[g]]:

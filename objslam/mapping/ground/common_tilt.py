@@ -30,37 +30,40 @@ _PLACE = 0.1
 """The prior standard deviation (m) of x and of y of a pose. A robot that is nearer to its things than its pose says sees
 them farther up or down. A larger value takes more of the tilt for such errors."""
 _BOUNDS = np.log([[0.3, 1e-4, 1e-4], [5.0, 0.35, 10.0]])
-"""The logarithms of the least and largest factor on the noise of rays, tilt (rad) and height (m). Wider bounds allow rougher
-ground."""
+"""The logarithms of the least and the largest values of three numbers: the factor on the noise of rays, the tilt (rad) and
+the height (m). Wider bounds allow rougher ground."""
 _TILTS, _HEIGHTS = (0.003, 0.01, 0.03, 0.1), (1e-4, 0.1)
-"""The tilts (rad) and heights (m) at which the search may begin. It begins at the likeliest pair. More are slower."""
-_STRAY = 3.5
-"""The deviation of a stray ray, in standard deviations of the noise that remains. A larger number lets false boxes raise the
-tilt."""
-_MOST_LASTING, _RUN = 150, 10
-"""The most poses from which it is estimated how long the tilt lasts, and how many of them follow each other. More poses are
-more exact, and the time grows with their cube. Longer runs see shorter times less often."""
-_TIMES = tuple(0.25 * 2.0**k for k in range(9))
-"""The tried times (s) for which tilt lasts. The shortest fits a bump, the longest a slope. More are finer and slower."""
-_LARGER = (1.0, 1.5, 2.25)
-"""The tried sizes of tilt that lasts, as multiples of the size of tilt that is new in each pose. More are finer and
+"""The tilts (rad) and heights (m) at which the search may begin. The search begins at the likeliest pair. More values are
 slower."""
+_STRAY = 3.5
+"""The least deviation of a ray that is left out as a stray, in standard deviations of the noise that remains. A larger
+number lets false boxes raise the tilt."""
+_MOST_LASTING, _RUN = 150, 10
+"""The most poses from which the duration of a tilt is estimated, and the number of consecutive poses in one run. More poses
+are more exact, and the time grows with their cube. Longer runs show short durations less often."""
+_TIMES = tuple(0.25 * 2.0**k for k in range(9))
+"""The tried times (s) for which a tilt lasts. The shortest time fits a bump, and the longest fits a slope. More times give a
+finer result and are slower."""
+_LARGER = (1.0, 1.5, 2.25)
+"""The tried sizes of a tilt that lasts, as multiples of the size of a tilt that is new in each pose. More sizes give a finer
+result and are slower."""
 _CHANCE = 1e-3
-"""The chance of a false alarm: flat ground is found uneven. With a larger value, shorter logs can show uneven ground."""
+"""The probability that flat ground is found uneven. With a larger value, shorter logs can show uneven ground."""
 SIGNIFICANT = -2 * np.log(_CHANCE)
-"""The ground counts as uneven if tilt and height lower -2 ln of the likelihood by at least this value. It is the quantile of
-chi-squared that is exceeded with the probability `_CHANCE`. The 2 degrees of freedom are tilt and height."""
+"""The least decrease of -2 ln of the likelihood by tilt and height for which the ground counts as uneven. It is the quantile
+of chi-squared that is exceeded with the probability `_CHANCE`. The 2 degrees of freedom are tilt and height."""
 
 
 @dataclass(frozen=True)
 class _Poses:
-    """Sums over the rays of K poses, for P effects that do not differ from pose to pose. Rays are in units of their noise,
-    effects of their priors.
+    """Sums over the rays of K poses, for P effects that are equal in all poses. Rays are in units of their noise, and
+    effects in units of their priors.
 
-    shared: (K, n, n) the information about roll, pitch (rad), height (m), and perhaps x and y (m), so n is 3 or 5. pulled:
-    (K, n) this information times the error that fits best. crossed: (K, n, P) between the errors of a pose and the effects.
-    information: (P, P), vector: (P,) the same for the effects. squares: the sum of the squared misses. rays: the number of
-    rays. prior: as `Noise.prior`.
+    shared: (K, n, n) the information about the errors of each pose: roll, pitch (rad), height (m), and perhaps x and y (m).
+    So n is 3 or 5. pulled: (K, n) this information times the error that fits best. crossed: (K, n, P) the information
+    between the errors of a pose and the effects. information: (P, P) the information about the effects. vector: (P,) this
+    information times the effects that fit best. squares: the sum of the squared misses. rays: the number of rays. prior: as
+    `Noise.prior`.
     """
 
     shared: Floats
@@ -74,7 +77,8 @@ class _Poses:
 
     @classmethod
     def of(cls, miss: Floats, by_pose: Floats, effects: Floats, pose: Ints, prior: float) -> Self:
-        """Sum over rays. miss: (R,), by_pose: (R, n), effects: (R, P) derivatives. pose: (R,) the pose of each ray."""
+        """Return the sums over rays. miss: (R,) the misses. by_pose: (R, n), effects: (R, P) their derivatives by the errors
+        of the poses and by the effects. pose: (R,) the pose of each ray, in increasing order."""
         begin = np.flatnonzero(np.diff(pose, prepend=-1))
         return cls(
             shared=np.add.reduceat(by_pose[:, :, None] * by_pose[:, None, :], begin),
@@ -89,27 +93,29 @@ class _Poses:
 
     @cached_property
     def _shared(self) -> Floats:
-        """(n, n, K) `shared` with the poses last, because NumPy is slow if the last axis is short."""
+        """(n, n, K) `shared` with the poses along the last axis, because NumPy is slow if the last axis is short."""
         return np.ascontiguousarray(np.moveaxis(self.shared, 0, -1))
 
     @cached_property
     def _told(self) -> Floats:
-        """(n, 1 + P, K) `pulled`, then `crossed`, as columns of one array with the poses last."""
+        """(n, 1 + P, K) `pulled` and `crossed` as columns of one array, with the poses along the last axis."""
         return np.ascontiguousarray(np.moveaxis(np.concatenate([self.pulled[:, :, None], self.crossed], axis=2), 0, -1))
 
     def solve(self, logarithms: Floats, alike: Floats | None = None) -> tuple[float, Floats, Floats]:
         """Return -2 ln of the restricted likelihood, the effects (P,), and the errors of the poses (K, n).
 
-        logarithms: (3,) of three numbers: the factor on the noise of rays, the tilt, rad, and the height, m. alike: (K, K)
-        the correlation of the errors of two poses, None if they are independent. SolveError if the system is not finite.
+        logarithms: (3,) the logarithms of the factor on the noise of rays, of the tilt (rad), and of the height (m). alike:
+        (K, K) the correlation between the errors of two poses, None if they are independent. Raises a SolveError if the
+        system is not finite.
         """
         return self.solved(logarithms, None if alike is None else self.independent(alike))
 
     def independent(self, alike: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return what of `solve` depends on the correlation (K, K) of the errors of two poses alone.
+        """Return the arguments of `solved` that depend only on the correlation between the errors of two poses.
 
-        All poses become one, in which the errors of each kind are sums of independent numbers. Returned are the factors
-        (K, K) of these numbers, and `_told` (n, 1 + P, K) and `shared` (n, n, K, K) of them.
+        All poses become one. Its errors of each kind are sums of independent numbers. The returned values are the factors
+        (K, K) of the independent numbers in the sums, and `_told` (n, 1 + P, K) and `shared` (n, n, K, K) of the numbers.
+        alike: as in `solve`.
         """
         root = np.linalg.cholesky(alike + 1e-9 * np.eye(len(alike)))
         count = len(self._shared)
@@ -119,7 +125,7 @@ class _Poses:
         return np.asarray(root, dtype=np.float64), np.asarray(self._told @ root), shared
 
     def solved(self, logarithms: Floats, independent: tuple[Floats, Floats, Floats] | None) -> tuple[float, Floats, Floats]:
-        """Return the same as `solve`. independent: of the method of this name, None if all errors are new."""
+        """Return the same as `solve`. independent: what the method `independent` returns, None for independent errors."""
         factor, tilt, height = np.exp(logarithms)
         sigma = np.array([tilt, tilt, height, _PLACE, _PLACE])[: self.pulled.shape[1]] / factor
         if independent is None:
@@ -154,8 +160,9 @@ class Uneven:
     """How uneven the ground is.
 
     tilt: rad, the standard deviation of roll and of pitch. height: m, the standard deviation of the height. seconds: s, the
-    time after which the correlation of both is 1/e, 0 if both are new in each pose. share: the noise that tilt and height
-    add to a usual ray, as a multiple of its other noise. gain: by how much both lower -2 ln of the restricted likelihood.
+    time after which the correlation of tilts and of heights is 1/e, 0 if each pose has a new tilt and height. share: the
+    noise that tilt and height add to a usual ray, as a multiple of its other noise. gain: the decrease of -2 ln of the
+    restricted likelihood by tilt and height.
     """
 
     tilt: float
@@ -169,8 +176,8 @@ class Uneven:
 class CommonTilt:
     """The fit of a variance component model to the elevations of rays. Rays are in units of their noise.
 
-    ground: its tilt and height, new in each pose. logarithms: (3,) as in `_Poses.solve`. stamps: (R,) s. pose: (R,) the pose
-    of each ray. miss: (R,), by_pose: (R, 5), effects: (R, P) as in `_Poses.of`. prior: as `Noise.prior`.
+    ground: the unevenness, if each pose has a new tilt and height. logarithms: (3,) as in `_Poses.solve`. stamps: (R,) s.
+    pose: (R,) the pose of each ray. miss: (R,), by_pose: (R, 5), effects: (R, P) as in `_Poses.of`. prior: as `Noise.prior`.
     """
 
     ground: Uneven
@@ -183,10 +190,10 @@ class CommonTilt:
     prior: float
 
     def lasting(self) -> Uneven:
-        """Return the ground with the most likely time for which its tilt lasts, and with the size that the tilt then has.
+        """Return the ground with the most likely duration of its tilt, and with the size that the tilt has at this duration.
 
-        A tilt that lasts moves all rays of a thing up or down together, so the rays still meet. They show only a part of the
-        tilt, and the tilt is larger than this part.
+        A tilt that lasts moves all rays of a thing up or down together, so the rays still meet. The rays show only a part of
+        the tilt. The whole tilt is larger.
         """
         poses = np.unique(self.pose)
         every = -(-len(poses) // _MOST_LASTING)
@@ -206,15 +213,15 @@ class CommonTilt:
 
 
 _Solved = tuple[Floats, float, Callable[[Floats], Floats]]
-"""The right-hand sides L^-1 B of a system 1 + A = L L^T, the log of the determinant of 1 + A, and a function that solves L^T
-for one right-hand side."""
+"""The solution of a system 1 + A = L L^T. The three values are the right-hand sides L^-1 B, the logarithm of the determinant
+of 1 + A, and a function that solves L^T for one right-hand side."""
 
 
 def _of_each(inner: Floats, told: Floats) -> _Solved:
-    """Solve the systems of K poses at once, each with n unknowns, by elimination.
+    """Return the solutions of the systems of K poses, each with n unknowns, by elimination for all poses at once.
 
-    inner: (n, n, K), and told: (n, m, K). The rows of the solution are by unknown, then by pose. NumPy would call LAPACK for
-    each pose, which takes three times as long.
+    inner: (n, n, K) the matrices A. told: (n, m, K) the right-hand sides B. The rows of the solution are by unknown, then by
+    pose. NumPy would call LAPACK for each pose, which takes three times as long.
     """
     n, m, poses = told.shape
     rows = np.concatenate([inner, told], axis=1)
@@ -235,11 +242,11 @@ def _of_each(inner: Floats, told: Floats) -> _Solved:
 
 
 def _of_all(inner: Floats, told: Floats) -> _Solved:
-    """Solve one system. inner: (n, n), and told: (n, m)."""
+    """Return the solution of one system. inner: (n, n) the matrix A. told: (n, m) the right-hand sides B."""
     from scipy.linalg.lapack import dpotrf, dtrtrs  # Here, so that `load_libraries` comes first.
 
     root, _ = dpotrf((inner + np.eye(len(inner))).T, lower=1, clean=0, overwrite_a=1)
-    pivots = _positive(np.diagonal(root))  # They are not, or not finite, if LAPACK failed.
+    pivots = _positive(np.diagonal(root))  # If LAPACK failed, a pivot is not positive or not finite.
     white, _ = dtrtrs(root, told, lower=1)
     return (
         white,
@@ -249,7 +256,8 @@ def _of_all(inner: Floats, told: Floats) -> _Solved:
 
 
 def _positive(pivots: Floats) -> Floats:
-    """Return the pivots of the factorisation of 1 + A (`_Solved`). SolveError if a pivot is not finite and positive.
+    """Return the pivots of the factorisation of 1 + A (`_Solved`). Raises a SolveError if a pivot is not finite and
+    positive.
 
     If all rays are finite, 1 + A is positive definite, and its pivots are positive.
     """
@@ -259,7 +267,8 @@ def _positive(pivots: Floats) -> Floats:
 
 
 def common_tilt(keyframes: Keyframes, rays: Rays, point: Ints, points: Floats, prior: float) -> CommonTilt | None:
-    """Return how uneven the ground is below planar poses, None if no pose has several rays, or none shares an error.
+    """Return how uneven the ground is below planar poses. None if no pose has several rays, or the rays of no pose share an
+    error.
 
     A variance component model (Searle, Casella and McCulloch 1992). The elevation of a ray above its thing is a sum of four
     terms: the noise of the ray, the errors of its pose (roll, pitch, height, x, y), the error of the height of the thing,
@@ -307,8 +316,8 @@ def common_tilt(keyframes: Keyframes, rays: Rays, point: Ints, points: Floats, p
 def _derivatives(keyframes: Keyframes, rays: Rays, held: Ints, point: Ints, points: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the angles (R,), rad, by which rays pass above their things, and two derivatives of these angles.
 
-    The first derivatives (R, 5) are by roll, pitch, height, x and y of the pose. The second (R, P) are by the heights of the
-    things and by the roll and tilt of the cameras, in their prior standard deviations.
+    The first derivatives (R, 5) are by the roll, pitch, height, x and y of the pose. The second derivatives (R, P) are by
+    the heights of the things and by the roll and tilt of the cameras. These are in units of their prior standard deviations.
     """
     origin, direction = (values[held] for values in rays.in_map(keyframes.map_T_camera))
     to = points[point[held]] - origin

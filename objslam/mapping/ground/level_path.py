@@ -1,8 +1,8 @@
 """Level a map that was solved from planar odometry alone.
 
-Rays and odometry measure how a robot tilts relative to its first pose. How the first pose tilts, they do not say, so a solve
-holds it level. But a robot that accelerates, or stands on a bump, tilts by a degree, and the heights of all things 20 m away
-would then be wrong by 0.3 m. A floor is level where the robot is level on average.
+Rays and odometry measure how a robot tilts relative to its first pose. They do not say how the first pose tilts, so a solve
+holds the first pose level. But a robot that accelerates, or stands on a bump, tilts by a degree. The heights of all things
+20 m away would then be wrong by 0.3 m. So a floor is taken as level where the robot is level on average.
 """
 
 from dataclasses import replace
@@ -19,8 +19,8 @@ from objslam.mapping.solution import Solution
 def levelled(solution: Solution) -> Solution:
     """Return a solution without bodies, turned about its first pose so that the robot is level on average.
 
-    Nothing that was measured changes. With a localisation, or with poses that are not planar, the measured poses say how the
-    robot tilts, and the solution stays as it is.
+    The turned solution fits all measurements equally well. With a localisation, or with poses that are not planar, the
+    measured poses say how the robot tilts. The solution then stays as it is.
     """
     keyframes, estimate = solution.keyframes, solution.estimate
     if keyframes.localized_every or not is_planar(keyframes.map_T_base):

@@ -15,36 +15,38 @@ from objslam.mapping.ground.common_tilt import SIGNIFICANT, CommonTilt, Uneven, 
 from objslam.mapping.progress import Progress
 
 _FIRST = Uneven(np.radians(1.0), 0.05)
-"""The ground that is allowed for before the first estimate. With a smaller tilt, rougher ground takes more rounds. With a
-larger one, things above each other become one point. Their heights look like tilt, which confirms itself. From 4 degrees,
-it ended at 14 on a flat floor between shelves. From 1 degree, it grew to 6 in all simulated drives on such
-ground."""
+"""The unevenness that is allowed for before the first estimate. With a smaller tilt, rougher ground takes more rounds. With
+a larger tilt, things above each other become one point. Their heights look like tilt, so the next estimate is even larger.
+From 4 degrees, the estimates ended at 14 on the flat floor between shelves. From 1 degree, they reached the true tilt, up to
+6 degrees, in all simulated drives on rough ground."""
 _ROUNDS = 8
-"""The most estimates. More rounds are more exact and take longer."""
+"""The most estimates of the unevenness. More estimates are more exact and take longer."""
 _SAME = 0.05
-"""The rounds end if the noise that the ground adds changes by at most this share. A larger share ends sooner."""
+"""The change of the noise from the ground at which the rounds end, as a share. A larger share ends the rounds sooner."""
 _FEWEST = 60
 """The fewest boxes of a log from which the ground is estimated. Fewer boxes agree by chance."""
 _CROWD = 10.0
-"""In a larger crowd (`Part.crowd`), rays meet anywhere, and show nothing. At 8.5, the tilt of two simulated drives between
-rows of trees was found, and a flat one was flat. A larger value examines more logs."""
+"""The largest crowd (`Part.crowd`) of an examined log. In a larger crowd, rays meet anywhere, and show nothing. At 8.5, the
+tilt of two simulated drives between rows of trees was found, and a flat drive was found flat. A larger value examines more
+logs."""
 _LEAST = 0.5
 """The least noise that the ground must add to rays, as a multiple of their other noise. Less noise hardly changes a map. A
 larger number allows for uneven ground less often."""
 _LEAST_ALONE = 2.0
-"""The same, if the robot has odometry alone. A joint map absorbs small tilts by itself, and more freedom for the path costs
-true objects where labels are no names. Two rough orchards had 2.6 and 3.0, and lost nearly all trees on flat ground. A robot
-with legs had 1.7 and five flats 0.6 to 0.9, and their maps were better without. A larger number finds less rough ground."""
+"""The value of `_LEAST` for a robot with odometry alone. A joint map absorbs small tilts by itself. More freedom for the
+path costs true objects where labels are no names. Two rough orchards had 2.6 and 3.0, and their maps lost nearly all trees
+if flat ground was assumed. A robot with legs had 1.7, and five flats had 0.6 to 0.9. Their maps were better if flat ground
+was assumed. A larger number finds less rough ground."""
 _EXPLAINED = 0.4
-"""The least share of the boxes that must fit a point on the ground that was found. With wrong input, fewer fit, and what
-their poses share is not the ground. A larger share finds uneven ground in fewer logs."""
+"""The least share of the boxes that must fit points on the found ground. With wrong input, fewer boxes fit, and the errors
+that the rays of a pose share do not come from the ground. A larger share finds uneven ground in fewer logs."""
 
 
 def with_uneven_ground(log: Log, settings: Settings, ledger: Ledger, progress: Progress) -> Settings:
     """Return settings whose `planar` has the unevenness of the ground that the boxes show, if it moves rays.
 
-    The ledger gets a warning. The settings stay as they are if the poses are not planar, if `noise.ground` does not
-    allow the estimate, or if the boxes do not show it clearly.
+    The ledger gets a warning about uneven ground. The settings stay as they are if the poses are not planar, if
+    `noise.ground` does not allow the estimate, or if the boxes do not show uneven ground clearly.
     """
     use, usual = settings.noise.ground, settings.planar == type(settings.planar)()
     if not (usual if use == "auto" else use) or (settings.mode == "fixed" and coarse(settings)):
@@ -67,12 +69,12 @@ def with_uneven_ground(log: Log, settings: Settings, ledger: Ledger, progress: P
 
 
 def uneven_ground(log: Log, settings: Settings) -> Uneven | None:
-    """Return how uneven the ground is below the poses of a log, None if they are not planar or nothing shows it.
+    """Return how uneven the ground is below the poses of a log. None if they are not planar or no unevenness shows.
 
-    Without a localisation, short windows are examined, in which the odometry is sure.
+    Without a localisation, only short windows are examined, because the odometry drifts little in them.
 
-    Things are searched as points where rays meet, in a world that is flattened along z, so that the tilt hardly matters.
-    The tilt is estimated from these points (`common_tilt`), and the points are searched again with this tilt.
+    Things are points where rays meet. They are searched in a world that is flattened along z, where the tilt hardly matters.
+    The tilt is estimated from these points (`common_tilt`). The points are then searched again with this tilt.
     """
     path = log.odometry if log.localization is None else log.localization
     boxes = [one.detections for one in log.cameras if one.detections is not None and len(one.detections.frame_stamps)]
@@ -89,7 +91,8 @@ def uneven_ground(log: Log, settings: Settings) -> Uneven | None:
 
 
 def _last_fit(part: Part, settings: Settings, least: float) -> tuple[Agreement, CommonTilt] | None:
-    """Return the last points and the tilt that they show. None if the ground seems flat. least: as `_LEAST`."""
+    """Return the agreement and the tilt of the last round, None if the ground seems flat. least: the least noise that the
+    ground must add to rays, as `_LEAST`."""
     now, last = _FIRST, None
     for _ in range(_ROUNDS):
         at = agreement(part, part.log, _with(settings, now))

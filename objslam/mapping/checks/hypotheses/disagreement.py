@@ -9,35 +9,36 @@ from objslam.mapping.checks.hypotheses.mounts import unset
 from objslam.mapping.checks.hypotheses.trials import Trial, chance
 
 DISAGREE = "boxes disagree"
-"""The name of a finding whose cause no hypothesis explains."""
+"""The name of the finding that the boxes and the poses disagree, and no hypothesis explains why."""
 _BAD_SCORE = 0.5
-"""Boxes may disagree with the poses if their score, for the boxes with a ray, is below this. Logs of usual detectors have at
-least 0.56. With turned cameras, logs have at most 0.5, unless they show little parallax. Of 119 simulated robots with right
-cameras whose boxes fit poorly, mostly because of many false boxes, this accuses 11. Of 56 turned cameras, it accuses 47. At
-0.4, these are 8 and 44. A larger score accuses more logs."""
+"""The score below which boxes may disagree with the poses. It is the score of the boxes with a ray. Logs of usual detectors
+have at least 0.56. Logs with turned cameras have at most 0.5, unless they show little parallax. The finding accuses 11 of
+119 simulated robots with right cameras whose boxes fit poorly, mostly because of many false boxes. It accuses 47 of 56
+turned cameras. At 0.4, the finding accuses 8 robots and 44 cameras. A larger score accuses more logs."""
 _HARDLY = 0.1
-"""Boxes disagree if their score is below this, whatever the score by chance is. A larger score accuses more logs."""
+"""The score below which boxes disagree, whatever the score by chance is. A larger score accuses more logs."""
 _TIMES = 2.0
-"""Boxes agree only by chance if their score is below this multiple of the score by chance (`trials.chance`). Clean logs have
-at least 2.9 times the score by chance, logs with turned cameras at most 1.9 times. A larger value accuses more logs."""
+"""The multiple of the score by chance (`trials.chance`) below which boxes agree only by chance. Clean logs have at least 2.9
+times the score by chance, and logs with turned cameras at most 1.9 times. A larger value accuses more logs."""
 _DISTANT = 0.9
-"""If at least this share of the boxes fits a point or a direction, the boxes agree with the poses. The share is at least
+"""The share of the rays that fit a point or a direction, from which the boxes agree with the poses. The share is at least
 0.94 in logs without parallax, and at most 0.8 with turned cameras. A larger share accuses more logs."""
 _CONE = np.radians(4.0)
-"""The angle (rad) within which rays have one direction. Rays that differ by less give no point. A larger angle accuses fewer
+"""The largest angle (rad) between rays that count as one direction. Such rays give no point. A larger angle accuses fewer
 logs."""
 _PILE = 0.2
-"""The least share of a label's rays that show one distant thing. Fewer have one direction by chance. A larger share accuses
-more logs."""
+"""The least share of a label's rays that show one distant thing. A smaller share of the rays may have one direction by
+chance. A larger share accuses more logs."""
 _TRIED = 64  # The most directions that are tried for a distant thing. A larger number finds smaller piles.
 
 
 def disagree(found: Agreement, trials: list[Trial], part: Part) -> Finding | None:
     """Return a finding if the boxes agree with the poses only by chance, although they would show parallax.
 
-    found: the agreement after a correction of the usual errors of the cameras, from `without_usual_errors`. trials: of all
-    hypotheses. Turned mounts among them show the score by chance in this log. Things that are too far for parallax give no
-    point, but each has one direction. Boxes without a ray, such as those that the image's edge cuts off, show nothing.
+    found: the agreement after a correction of the usual errors of the cameras, from `without_usual_errors`. trials: the
+    trials of all hypotheses. The turned mounts among them show the score by chance in this log. Things that are too far for
+    parallax give no point, but each thing has one direction. Boxes without a ray, such as those that the image's edge cuts
+    off, do not count.
     """
     by_chance = chance(trials)
     rays = len(found.rays)

@@ -20,10 +20,10 @@ take longer."""
 _SQUARES = (320, 416, 512, 640)
 """The sides (px) of square images that detectors often use. More sides take longer."""
 _CLIPPED, _AT_EDGE = 0.05, 1.0
-"""A detector clips boxes at the right and the lower edge of the image. Two facts show that boxes are in px of the
-calibration's images: at least the share `_CLIPPED` of the boxes ends within `_AT_EDGE` (px) of an edge, and hardly any box
-ends beyond it. In another unit, boxes end there only by chance. With a larger share, more wrong sizes are tried. With a
-larger distance, fewer are tried."""
+"""The least share of boxes that end at an edge of the image, and the distance (px) from the edge that counts as the edge. A
+detector clips boxes at the right and the lower edge of the image. If at least this share of the boxes ends at an edge, and
+hardly any box ends beyond the edge, the boxes are in px of the calibration's images. In another unit, boxes end there only
+by chance. With a larger share, more wrong sizes are tried. With a larger distance, fewer are tried."""
 _CLOCK = np.concatenate([-np.arange(0.5, 6.1, 0.5), np.arange(0.5, 6.1, 0.5)])
 """The tried clock offsets (s). `small_errors` finds smaller offsets."""
 
@@ -39,7 +39,7 @@ def hypotheses(log: Log) -> Iterator[Hypothesis]:
 
 
 def coarse_hypotheses(log: Log) -> Iterator[Hypothesis]:
-    """Yield the hypotheses about mounts, paths and images. A wrong one moves most rays by far."""
+    """Yield the hypotheses about mounts, paths and images. Each wrong hypothesis of this kind moves most rays by far."""
     yield from mounts(log)
     yield from _paths(log)
     yield from _images()
@@ -99,7 +99,7 @@ def _images() -> Iterator[Hypothesis]:
 
 
 def _boxes(sized: bool) -> Iterator[Hypothesis]:
-    """Yield the hypotheses about the unit and the order of boxes. sized: whether the boxes have a size. Without it, the
+    """Yield the hypotheses about the unit and the order of boxes. sized: whether the boxes have a size. If not, the
     hypotheses about width and height are left out."""
     known: tuple[tuple[str, str, str, Callable[[Floats, Camera], Floats]], ...] = (
         ("boxes xywh", "boxes read as x y width height", "the boxes are x y width height, not x1 y1 x2 y2", _xywh),
@@ -122,8 +122,11 @@ def _boxes(sized: bool) -> Iterator[Hypothesis]:
 
 
 def _squares(edges: set[int]) -> Iterator[Hypothesis]:
-    """Yield the hypotheses that the boxes are in px of the square image that a detector gets. edges: px, the edges at which
-    boxes end, from `_clipped_edges`. A square is left out if boxes end at an edge that is not its own."""
+    """Yield the hypotheses that the boxes are in px of the square image that a detector gets.
+
+    edges: px, the widths and heights at which boxes end, from `_clipped_edges`. A square is left out if boxes end at the
+    edge of another size.
+    """
     for side in _SQUARES:
         if edges - {side}:
             continue
@@ -180,7 +183,7 @@ def _yaw_times(poses: Floats, factor: float) -> Floats:
 
 
 def _from_degrees(poses: Floats) -> Floats:
-    """Correct poses whose headings (degrees) were taken for radians.
+    """Return corrected poses whose headings (degrees) were taken for radians.
 
     A rotation matrix keeps a heading modulo 2 pi, so multiples of 6.3 degrees are lost here. Two assumptions restore them: a
     robot turns evenly, and it drives in the direction of its heading.

@@ -8,10 +8,13 @@ from objslam.core.types import CameraLog, Log
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A possible fault of the input. name: short and fixed. what: a description of the corrected log. cause: the probable
-    mistake. put_right: returns the corrected log. of_mount: whether it is about how a camera is turned on the robot. usual:
-    whether people often make this mistake. Of two hypotheses that explain a log equally, the usual one is named. clock: the
-    time (s) by which it makes the stamps of the frames later, 0 if it is not about a clock."""
+    """A possible fault of the input.
+
+    name: a short fixed name. what: a description of the corrected log. cause: the probable mistake. put_right: returns the
+    corrected log. of_mount: whether the hypothesis is about the rotation of a camera on the robot. usual: whether people
+    often make this mistake. If two hypotheses explain a log equally, the usual one is named. clock: the time (s) by which
+    `put_right` makes the stamps of the frames later, 0 if the hypothesis is not about a clock.
+    """
 
     name: str
     what: str

@@ -22,30 +22,31 @@ from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis, with_camera
 from objslam.mapping.checks.hypotheses.trials import Trial
 
 LENS = "other distortion"
-"""The name of the finding."""
+"""The name of the finding that boxes fit better with another distortion of the lens."""
 _BENT = 0.02
 """The least angle (rad) by which the distortion of a tested camera must bend a ray at the middle of an edge of its image. A
 smaller angle tests more cameras in vain, because noise hides their distortion."""
 _BARREL = (-0.1, -0.2)
-"""The first coefficients of the lenses that are tried for a camera without distortion. Lenses of 50 to 80 degrees have -0.05
-to -0.4. More coefficients take longer."""
+"""The first distortion coefficients of the lenses that are tried for a camera without distortion. Lenses with a field of
+view of 50 to 80 degrees have -0.05 to -0.4. More coefficients take longer."""
 _MORE = 0.05
-"""At poses of a localisation, another lens must raise the score by this. In 24 simulated logs with lenses of -0.3 to 0.1,
-the right lens raises it by 0.06 to 0.19 where the mistake is large, and a wrong one by at most 0.02. A larger value finds
-fewer mistakes."""
+"""The least growth of the score by another lens, at poses of a localisation. In 24 simulated logs with lenses of -0.3 to
+0.1, the right lens raises the score by 0.06 to 0.19 where the mistake is large. A wrong lens raises it by at most 0.02. A
+larger value finds fewer mistakes."""
 _MORE_BOXES = 15
 """The least number of additional boxes that must fit, weighted as in the score. A larger number needs longer logs."""
 _DOUBTED = 0.7
-"""A camera without distortion is tested at poses of a localisation only if the score of the log is below this. Right logs
-have 0.75 in simulation. A larger value tests more right logs, which takes time."""
+"""The score of a log at poses of a localisation below which a camera without distortion is tested. Right logs have 0.75 in
+simulation. A larger value tests more right logs, which takes time."""
 _IN_WINDOWS = -0.015
-"""In windows of odometry, a log without the distortion of its cameras must have more than its score with it, plus this, to
-be tested by a solve. In simulated logs, the mistake changes the score by -0.01 to 0.03. In right logs with a strong
+"""The least change of the score, in windows of odometry, if the distortion of the cameras is removed. With a larger change,
+a solve tests the log. In simulated logs, the change is -0.01 to 0.03 with the mistake. In right logs with a strong
 distortion, the change is at most -0.02. A larger value saves solves and finds fewer mistakes."""
 
 
 def check_lens(part: Part, found: Agreement, settings: Settings) -> tuple[Finding, Trial] | None:
-    """Return a finding and its trial if boxes fit better with another distortion, None if not. found: of the part's log."""
+    """Return a finding and its trial if boxes fit better with another distortion, else None. found: the agreement of the
+    part's log."""
     distorted = any(_bends(one.camera) for one in part.log.cameras if one.camera.sees_size)
     if not distorted and (part.drifts or found.score > _DOUBTED):
         return None
@@ -67,7 +68,7 @@ def check_lens(part: Part, found: Agreement, settings: Settings) -> tuple[Findin
 
 
 def _lenses(log: Log, distorted: bool) -> Iterator[Hypothesis]:
-    """Yield the hypotheses. distorted: whether a camera of the log has a distortion."""
+    """Yield the hypotheses about the lenses of a log. distorted: whether a camera of the log has a distortion."""
     if distorted:
         yield Hypothesis(
             LENS,

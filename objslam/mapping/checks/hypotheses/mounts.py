@@ -21,13 +21,13 @@ from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis, with_camera
 _OPTICAL = make_pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 """The pose of an optical frame (x right, y down, z forward) in a body frame (x forward, y left, z up)."""
 _SIDES = {"ahead": 0, "to the left": 90, "back": 180, "to the right": -90}
-"""The usual directions of a camera (degrees)."""
+"""The usual directions in which a camera looks, as headings on the robot (degrees)."""
 _SAME = 1e-3
 """The largest difference of the entries of two rotation matrices that are the same mount. A larger value tries fewer."""
 
 
 def mounts(log: Log) -> Iterator[Hypothesis]:
-    """Yield each hypothesis about the mounts of a log. None if the cameras move on the robot."""
+    """Yield each hypothesis about the mounts of a log. Yield nothing if all cameras move on the robot."""
     if all(one.mount is not None for one in log.cameras):
         return
     tried = [_rotations(log)]
@@ -46,7 +46,7 @@ def unset(log: Log) -> bool:
 
 
 def w_last(poses: Floats) -> Floats:
-    """Correct poses (..., 4, 4) whose quaternions were stored with w first, but were read with w last."""
+    """Return corrected poses (..., 4, 4) whose quaternions were stored with w first, but were read with w last."""
     read = quaternion_from_rotation(poses[..., :3, :3])
     return make_pose(rotation_from_quaternion(np.roll(read, -1, axis=-1)), poses[..., :3, 3])
 
@@ -133,7 +133,8 @@ def _turned_in_base(pose: Floats, turn: Floats) -> Floats:
 def _mirrored(pose: Floats, axis: int) -> Floats:
     """Return a mount that looks where its mirror image looks. axis: the axis of base that is reversed, 1 for y, 2 for z.
 
-    A mirrored frame would be left-handed. So one axis of the camera is reversed too: x with y of base, y with z of base.
+    A mirrored frame would be left-handed. So one axis of the camera is reversed as well: x together with y of base, or y
+    together with z of base.
     """
     base, camera = np.eye(3), np.eye(3)
     base[axis, axis] = camera[axis - 1, axis - 1] = -1.0

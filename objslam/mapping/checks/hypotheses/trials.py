@@ -15,58 +15,58 @@ from objslam.mapping.checks.path import straightness
 from objslam.mapping.progress import Progress
 
 _TIMES, _MORE = 1.2, 0.06
-"""A hypothesis must raise the score by this factor and by this difference. Larger values name fewer causes."""
+"""The least factor and the least difference by which a hypothesis must raise the score. Larger values name fewer causes."""
 _CROWD = 1.4
-"""In a larger crowd (`Part.crowd`) than this, rays meet by chance. The unnamed posts of the MRCLAM robots have 1.9. With a
-larger value, fewer logs need the larger limits below."""
+"""The crowd (`Part.crowd`) above which rays meet by chance. The unnamed posts of the MRCLAM robots have 1.9. With a larger
+value, fewer logs need the larger limits below."""
 _CROWD_TIMES, _CROWD_MORE = 2.0, 0.25
-"""In a crowd (above `_CROWD`), these values replace `_TIMES` and `_MORE`. Larger values name fewer causes."""
+"""The values of `_TIMES` and `_MORE` in a crowd above `_CROWD`. Larger values name fewer causes."""
 _MORE_BOXES = 25
 """The least number of additional boxes that must fit. A larger number needs longer logs."""
 _CROOKED, _STRAIGHT = 0.62, 0.85
-"""Below the first straightness, the axes of a path may be wrong. Corrected axes must reach the second straightness. In real
-logs, hand-held cameras have 0.68 and more, wheels 0.94, and wrong axes at most 0.59. A larger first value suspects more
+"""The straightness of a path below which its axes may be wrong, and the straightness that corrected axes must exceed. In
+real logs, hand-held cameras have 0.68 and more, wheels 0.94, and wrong axes at most 0.59. A larger first value suspects more
 paths. A larger second value accepts fewer corrections."""
 _NOT_WORSE = 0.8
-"""A hypothesis about the axes of a path must keep this share of the score. In sparse logs, boxes hardly depend on the axes.
-A larger share accepts fewer corrections."""
+"""The least share of the score that a hypothesis about the axes of a path must keep. In sparse logs, boxes hardly depend on
+the axes. A larger share accepts fewer corrections."""
 _EQUAL = 0.95
-"""Another hypothesis is as good as the best if it has this share of the best score. A larger share names fewer
+"""The share of the best score from which another hypothesis is as good as the best. A larger share names fewer
 alternatives."""
 _HALF = 0.5
-"""A hypothesis about a log with a localisation must let at least this share of the boxes fit. A hypothesis that explains
-fewer boxes fits by chance: the right hypothesis lets 0.9 of the boxes fit. A larger share names fewer causes."""
+"""The least share of fitting boxes of a hypothesis about a log with a localisation. A hypothesis with fewer fitting boxes
+fits by chance: the right hypothesis lets 0.9 of the boxes fit. A larger share names fewer causes."""
 _RIVAL = 0.02
-"""A mount explains the boxes as well as an unusual error if its score is at most this much smaller. Two fits of one log with
+"""The largest loss of score of a mount that explains the boxes as well as an unusual error does. Two fits of one log with
 different random pairs differ by as much. A larger value names more mounts."""
 
 _BOTH_WAYS = 0.8
-"""An earlier and a later clock contradict each other if the worse of the two has at least this share of the score of the
-better. A clock has one error. In simulated logs with a wrong clock, no shift the other way has more than 0.61 of the best
-score. A smaller share names fewer clocks."""
+"""The ratio of the scores of an earlier and a later clock, worse to better, from which the clocks contradict each other. A
+camera has one clock error. In simulated logs with a wrong clock, no shift in the other direction has more than 0.61 of the
+best score. A smaller share names fewer clocks."""
 _CHANCE = 90.0
 """The percentage of all turned mounts that have at most the score of chance. With a larger percentage, more agreement counts
 as chance."""
 _LEFT, _TIMES_CHANCE = 0.62, 1.5
-"""At poses of a localisation, a hypothesis is compared with turned mounts, which fit by chance. It must pass one of two
-tests. Its misfit (1 - score) is at most the share `_LEFT` of theirs, or its score is at least `_TIMES_CHANCE` times theirs.
-The tests are needed because noisy poses spoil a true fit, but hardly a fit by chance. So a wrong hypothesis may fit better
-than the unchanged log. In 80 logs of
-16 simulated robots with a mistake, the right hypothesis leaves at most 0.57. In noisy logs without a mistake, the best
-hypothesis leaves at least 0.68, and has at most 1.36 times the score. A larger share and a smaller multiple name more
-causes."""
+"""The limits of two tests that compare a hypothesis with turned mounts, which fit by chance. They count at poses of a
+localisation. A hypothesis must pass one of the tests. Its misfit (1 - score) must be at most the share `_LEFT` of the misfit
+by chance, or its score at least `_TIMES_CHANCE` times the score by chance. Noisy poses spoil a true fit, but hardly a fit by
+chance. So a wrong hypothesis may fit better than the unchanged log. In 80 logs of 16 simulated robots with a mistake, the
+right hypothesis leaves a share of at most 0.57. In noisy logs without a mistake, the best hypothesis leaves at least 0.68,
+and has at most 1.36 times the score. A larger share and a smaller multiple name more causes."""
 _BEYOND, _FAR_BETTER = 1.3, 1.5
-"""A mount is clear if its score is at least `_BEYOND` times the score by chance, and at least `_FAR_BETTER` times the score
-of the unchanged log. Logs of five kinds of simulated robots and of three real robots were tried, with odometry alone and a
-turned camera. The right turn has 1.2 to 3.7 times the score of chance, mostly more than 1.4. No mount has more than 1.34
-times the score of a clean log. Larger multiples keep fewer findings that no solve supports."""
+"""The least scores of a clear mount, as multiples of the score by chance (`_BEYOND`) and of the score of the unchanged log
+(`_FAR_BETTER`). Logs of five kinds of simulated robots and of three real robots were tried, with odometry alone and a turned
+camera. The right turn has 1.2 to 3.7 times the score by chance, mostly more than 1.4. No mount has more than 1.34 times the
+score of a clean log. Larger multiples keep fewer findings that no solve supports."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """The test of a hypothesis. score, share: as in `Agreement`. straight: as in `path.straightness`, None if unknown.
+    """The test of a hypothesis.
 
-    seen: the share of the boxes that the image's edge does not cut off.
+    hypothesis: None for the unchanged log. score, share: as in `Agreement`. straight: as returned by `path.straightness`,
+    None if unknown. seen: the share of the boxes that the image's edge does not cut off.
     """
 
     hypothesis: Hypothesis | None
@@ -77,13 +77,12 @@ class Trial:
 
     @property
     def of_whole(self) -> float:
-        """The score if boxes that the image's edge cuts off do not count."""
+        """The score without the boxes that the image's edge cuts off."""
         return self.score / self.seen if self.seen > 0 else 0.0
 
 
 def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Settings, progress: Progress) -> list[Trial]:
-    """Return a trial of the unchanged log, and behind it a trial of each hypothesis, in the order from the best to the
-    worst."""
+    """Return the trial of the unchanged log, followed by the trials of all hypotheses, from the best to the worst."""
     first = _unchanged(before, log)
     every = list(hypotheses(part.log))
 
@@ -121,15 +120,15 @@ def _seen(found: Agreement) -> float:
 def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = "") -> Finding | None:
     """Return a finding if a hypothesis explains the boxes, or the path, much better than the unchanged log.
 
-    Two scores must be better: the score of all boxes, and the score without the boxes that the image's edge cuts off. They
-    have no ray, so they cannot fit. If x and y of right boxes are swapped, many of them get a ray, and some fit by chance.
-    A box with its centre outside the image has no ray either, but it counts as a box that does not fit.
+    Two scores must be better: the score of all boxes, and the score without the boxes that the image's edge cuts off. Cut
+    off boxes have no ray, so they cannot fit. If x and y of right boxes are swapped, many cut off boxes get a ray, and some
+    fit by chance. A box with its centre outside the image has no ray either, but counts as a box that does not fit.
 
     corrected: the score of the log without the errors that a run estimates. A hypothesis must also explain the boxes much
-    better than this: a mount with another order of its quaternion may look like a mount that is tilted a little. unusual:
-    the errors, in words, that are too large for a usual mount, "" if there are none. If there are such errors, a wrong mount
-    that explains the boxes equally well is the more probable cause. The finding names this mount. It does not spoil the map,
-    because the run corrects the error.
+    better than these errors do: a mount with another order of its quaternion may look like a mount that is tilted a little.
+    unusual: the errors, in words, that are too large for a usual mount, "" if there are none. If there are such errors, a
+    wrong mount that explains the boxes equally well is the more probable cause. The finding then names this mount. This
+    finding does not spoil the map, because the run corrects the error.
     """
     first, rest = trials[0], trials[1:]
     by_chance = None if part.drifts else chance(rest)
@@ -178,8 +177,8 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
 
 
 def _both_ways(good: Sequence[Trial]) -> list[Trial]:
-    """Return the trials with another clock, the best first, if earlier and later clocks fit about equally. Else return
-    none."""
+    """Return the trials with another clock, if earlier and later clocks fit about equally well. Return no trials otherwise.
+    The best trial comes first."""
     clocks = [trial for trial in good if _shift(trial)]
     earlier, later = (max((t.score for t in clocks if sign * _shift(t) > 0), default=0.0) for sign in (-1, 1))
     return clocks if clocks and min(earlier, later) >= _BOTH_WAYS * max(earlier, later) else []
@@ -200,15 +199,17 @@ def _of_another_drive(first: Trial, best: Trial) -> Finding:
 
 
 def chance(trials: Sequence[Trial]) -> float | None:
-    """Return the score that boxes reach by chance in this log: the score of the best tenth of all turned mounts. At most one
-    of these mounts is right. None if no mounts were tried."""
+    """Return the score that boxes reach by chance in this log, None if no mounts were tried.
+
+    It is the score from which the best tenth of all turned mounts begins. At most one mount is right.
+    """
     turned = [trial.score for trial in trials if trial.hypothesis is not None and trial.hypothesis.of_mount]
     return float(np.percentile(turned, _CHANCE)) if turned else None
 
 
 def clear(trials: Sequence[Trial], name: str) -> bool:
-    """Return whether a mount, by the name of its hypothesis, is far better than the unchanged log, and far better than
-    chance."""
+    """Return whether a mount is far better than the unchanged log and far better than chance. name: the name of the mount's
+    hypothesis."""
     by_chance = chance(trials)
     scores = [t.score for t in trials if t.hypothesis is not None and t.hypothesis.of_mount and t.hypothesis.name == name]
     return by_chance is not None and max(scores, default=0.0) >= max(_BEYOND * by_chance, _FAR_BETTER * trials[0].score)

@@ -6,18 +6,18 @@ from objslam.core.arrays import Bools, Ints
 from objslam.mapping.checks.finding import Finding
 
 _HALF = 0.5
-"""The halves of a log differ if the share of fitting rays in one half is below this multiple of the share in the other half.
-A larger value finds smaller differences."""
+"""The ratio between the shares of fitting rays in the two halves, worse to better, below which the halves differ. A larger
+value finds smaller differences."""
 _FEW, _PART = 2, 0.1
-"""A half sees an object if it has at least this number and this share of the object's rays. With smaller values, a chance
-fit counts as an object. About a tenth of the boxes of another recording fit an object of their label by chance."""
+"""The least number of an object's rays, and the least share of them, in a half that sees the object. With smaller values, a
+fit by chance counts as an object. About a tenth of the boxes of another recording fit an object of their label by chance."""
 
 
 def check_halves(late: Bools, fits: Bools) -> Finding | None:
     """Return a finding if one half of the log fits worse than the other half.
 
-    late: (R,) whether a ray is in the second half. fits: (R,) whether it fits its object. A half without rays differs from
-    nothing.
+    late: (R,) whether a ray is in the second half. fits: (R,) whether a ray fits its object. If one half has no rays, there
+    is no finding.
     """
     if late.all() or not late.any():
         return None
@@ -33,7 +33,7 @@ def check_halves(late: Bools, fits: Bools) -> Finding | None:
 
 
 def seen_in_both(late: Bools, fits: Bools, owner: Ints) -> float:
-    """Return the share of a half's fitting rays whose objects the other half sees too. The half with the larger share
+    """Return the share of a half's fitting rays whose objects the other half sees too. The larger share of the two halves
     counts.
 
     A robot that drives on to new places no longer sees most of the old objects, so the smaller share says less. late, fits:

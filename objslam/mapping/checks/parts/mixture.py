@@ -7,13 +7,14 @@ from objslam.mapping.checks.agreement import Agreement, Part
 from objslam.mapping.checks.finding import Finding
 
 _RAYS, _FRAMES = 3, 40
-"""A frame is judged if it has at least `_RAYS` rays, and a log if it has at least `_FRAMES` such frames. Fewer rays may all
-fit, or all miss, by chance. With larger numbers, fewer logs are judged."""
+"""The fewest rays of a judged frame, and the fewest judged frames of a judged log. Fewer rays may all fit, or all miss, by
+chance. With larger numbers, fewer logs are judged."""
 _BAD, _GOOD = 0.34, 0.67
-"""A frame is bad up to the first share of fitting rays, and good from the second on. Values farther apart find fewer mixed
-logs."""
+"""The largest share of fitting rays in a bad frame, and the least share in a good frame. Values farther apart find fewer
+mixed logs."""
 _LEAST = 0.2
-"""The least share of bad and of good frames. A larger value needs more frames of the other recording."""
+"""The least share of bad frames, and the least share of good frames. A larger value needs more frames of the other
+recording."""
 _DISPERSION = 1.6
 """The least variance of the frames' shares of fitting rays, as a multiple of the variance by random false boxes. Clean logs
 have 0.8 to 1.0. Logs with half of the boxes from another recording have 2.1 to 2.6. A larger value finds fewer mixed
@@ -21,7 +22,7 @@ logs."""
 
 
 def check_mixture(found: Agreement, part: Part) -> Finding | None:
-    """Return a finding if some frames belong to another recording. None for odometry, which drifts within windows."""
+    """Return a finding if some frames belong to another recording. None at poses by odometry, which drift within windows."""
     if part.drifts:
         return None
     judged = ~found.narrow

@@ -4,9 +4,10 @@ All other errors of a camera are the same in both halves: its clock, its place, 
 first. They are estimated together with the turn. Otherwise they look like a turn: a late clock moves all rays to one side
 while the robot turns left, and to the other side while it turns right.
 
-The errors of poses last for seconds, and many boxes share them. The covariance of an estimate takes each box as new, so it
-is too small at the poses of a particle filter. So the estimate is repeated without each eighth of the boxes. How much it
-changes shows its real error (jackknife with blocks, Kuensch 1989). A turn must be far larger than this error.
+The errors of poses last for seconds, and many boxes share them. The covariance of an estimate treats the boxes as
+independent, so it is too small at the poses of a particle filter. So the estimate is repeated without each eighth of the
+boxes. The changes of the estimate show its real error (jackknife with blocks, Kuensch 1989). A turn must be far larger than
+this error.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,22 +35,21 @@ _SAME = 1e-3
 """The prior standard deviation of the change of all other errors, as a share of the prior standard deviation of the errors.
 The graph divides by it, so it is not 0. A larger value lets the other errors change too."""
 MOVED = 0.05
-"""If a camera's rotation differs by more than this (rad) between the halves of a log, it was moved. A larger value warns
-less often."""
+"""The least change of a camera's rotation (rad) between the halves of a log that shows that the camera was moved. A larger
+value warns less often."""
 SIGMAS = 5.0
-"""A camera was moved only if its rotation differs between the halves by more than this number of standard deviations. The
-standard deviations of the estimate and of the jackknife both count. A larger number warns less often."""
+"""The least change of a moved camera's rotation, in standard deviations. The change must exceed this number of standard
+deviations of the estimate, and of the jackknife. A larger number warns less often."""
 _SUSPECT, _SUSPECT_SIGMAS = 0.5, 2.0
-"""The least difference for which another round of the estimation follows: as a multiple of `MOVED`, and in standard
-deviations. In the first round, only the rays fit that show a small difference. Larger values take less time, and find fewer
-turns."""
+"""The least change for which another round of the estimation follows: as a multiple of `MOVED`, and in standard deviations.
+In the first round, only rays that show a small change fit. Larger values take less time, and find fewer turns."""
 _BLOCKS = 8
-"""The number of pieces of time, with equally many boxes, that are left out one at a time. They must be longer than errors of
-poses last. More pieces are shorter, and take longer."""
+"""The number of pieces of time that are left out one at a time. All have equally many boxes. A piece must be longer than the
+errors of poses last. More pieces are shorter, and take longer to compute."""
 _MOVED_BY_ODOMETRY, _GAIN_BY_ODOMETRY = 0.1, 0.03
-"""For poses by odometry, `_MOVED_BY_ODOMETRY` (rad) replaces `MOVED`, and a turn must also let the score
-(`Agreement.score`) grow by `_GAIN_BY_ODOMETRY`. The reason is drift: it looks like a rotation of the camera, and the
-standard deviations do not contain it. Larger values warn less often."""
+"""The value of `MOVED` (rad) for poses by odometry, and the least growth of the score (`Agreement.score`) by a turn at such
+poses. Drift looks like a rotation of the camera, and the standard deviations do not contain drift. Larger values warn less
+often."""
 
 
 def check_moved_camera(part: Part, middle: float, settings: Settings) -> list[Finding]:
@@ -92,9 +92,9 @@ def finding_of_turns(moved: Mapping[str, float]) -> list[Finding]:
 
 
 def in_halves(cameras: Sequence[CameraLog]) -> tuple[CameraLog, ...]:
-    """Return two cameras in place of each one: first the cameras of the first half, then the cameras of the second half.
+    """Return two cameras for each camera: first all cameras of the first half, then all cameras of the second half.
 
-    All of them have the boxes of both halves.
+    Each of them has the boxes of both halves.
     """
     later = [replace(one, camera=replace(one.camera, name=one.camera.name + _LATER)) for one in cameras]
     return (*cameras, *later)
@@ -108,8 +108,8 @@ def first_half(name: str) -> str:
 def _spreads(halves: Part, turned: Calibration, settings: Settings) -> dict[str, float]:
     """Return the standard deviation (rad) of each turn between the halves, by the jackknife.
 
-    turned: the errors of the whole log. Each estimate without a block starts from them, because fewer rays fit without them.
-    If nothing can be estimated without a block, the block counts as no change.
+    turned: the errors of the whole log. Each estimate starts from these errors, because fewer rays fit without them. If
+    nothing can be estimated without a block, the block counts as no change.
     """
     stamps = [np.zeros(0) if one.detections is None else one.detections.frame_stamps for one in halves.log.cameras]
     every = np.sort(np.concatenate([one.detections.stamps for one in halves.log.cameras if one.detections is not None]))
@@ -128,7 +128,7 @@ def _spreads(halves: Part, turned: Calibration, settings: Settings) -> dict[str,
 
 
 def _take(part: Part, kept: Sequence[Bools]) -> Part:
-    """Return the part with some of the frames of each camera. kept: (F,) for each camera."""
+    """Return the part with some of the frames of each camera. kept: for each camera, which frames (F,) to take."""
     cameras = [
         one if one.detections is None else replace(one, detections=take_frames(one, mine))
         for one, mine in zip(part.log.cameras, kept, strict=True)
@@ -138,9 +138,10 @@ def _take(part: Part, kept: Sequence[Bools]) -> Part:
 
 
 def _halves(part: Part, middle: float) -> Part:
-    """Return the part with two cameras in place of each camera: one with its first half, and one with its second half.
+    """Return the part with two cameras in place of each camera: one with the first half of its frames, and one with the
+    rest.
 
-    The halves have windows of their own, and so points of their own.
+    The halves have windows of their own, so each half has its own points.
     """
     cameras: list[CameraLog] = []
     windows: list[Ints] = []
@@ -157,7 +158,8 @@ def _halves(part: Part, middle: float) -> Part:
 def one_rotation_each(errors: SharedErrors, turn: float = _TURN) -> Floats:
     """Return a prior covariance (P, P) that lets only the rotations of a camera differ between the halves.
 
-    errors: of the cameras of two halves. turn: rad, the standard deviation of the difference. With 0, nothing differs.
+    errors: the shared errors of the cameras of two halves. turn: rad, the standard deviation of the difference. With 0, no
+    error differs.
     """
     sigma = np.sqrt(np.diagonal(errors.prior))
     prior = np.diag(sigma**2)
@@ -169,20 +171,21 @@ def one_rotation_each(errors: SharedErrors, turn: float = _TURN) -> Floats:
 
 
 def _pairs(names: tuple[str, ...]) -> list[tuple[int, int]]:
-    """Return the indices of each error of a first half, and of the same error of the second half."""
+    """Return pairs of indices: an error of the first half, and the same error of the second half."""
     split = [name.rpartition(".") for name in names]
     pairs = [(i, f"{camera}{_LATER}.{what}") for i, (camera, _, what) in enumerate(split)]
     return [(i, names.index(later)) for i, later in pairs if later in names]
 
 
 def _changes(found: Calibration) -> dict[str, float]:
-    """Return by how much (rad) each rotation of a camera changes between the halves, by the name of the first half."""
+    """Return the change (rad) of each rotation of a camera between the halves, by the name of the error in the first
+    half."""
     pairs = [(i, j) for i, j in _pairs(found.names) if kind(found.names[i]) in _AXES]
     return {found.names[i]: float(found.values[j] - found.values[i]) for i, j in pairs}
 
 
 def turns(found: Calibration, least: float, sigmas: float) -> dict[str, float]:
-    """Return the turns (rad) between the halves that are larger than `least`, and larger than a number of standard
+    """Return the turns (rad) between the halves that are larger than `least` (rad) and larger than `sigmas` standard
     deviations."""
     turns, changes = {}, _changes(found)
     for i, j in _pairs(found.names):

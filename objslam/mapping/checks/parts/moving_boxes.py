@@ -1,4 +1,4 @@
-"""Whether the boxes of a time show that the camera moved, or that it stood."""
+"""Find out whether the boxes of a period of time show that the camera moved, or that it stood."""
 
 import numpy as np
 
@@ -6,32 +6,34 @@ from objslam.core.arrays import Bools
 from objslam.core.types import Detections, Log
 
 _NEAR = 12.0
-"""Two boxes lie at one place of the image if their centres are nearer than this (px). It exceeds the noise of boxes. Things
-that a moving camera passes move farther than this within `_LATER`. A larger distance takes slow motion for a stop."""
+"""The largest distance (px) between the centres of two boxes at one place of the image. It exceeds the noise of boxes.
+Things that a moving camera passes move farther within `_LATER`. A larger distance takes slow motion for a stop."""
 _NEAR_SHARE = 0.1
-"""The same distance as a share of the mean of a box's width and height, because the noise of a box grows with its size."""
+"""The value of `_NEAR` as a share of the mean of a box's width and height, if this is larger. The noise of a box grows with
+its size."""
 _LATER = 2.0
 """The time (s) after which a box shows whether it moved. A longer time shows slower motions, and needs longer stops."""
 _STAYS = 0.25
-"""Of the other frames with a box of this label, those at least `_LATER` away are compared. A box stays if more than this
-share of them has a box of its label at its place. Detectors miss a thing in some frames, and moving boxes come back to one
-place in few. With a larger share, a thing that is often missed beside others of its label does not stay."""
+"""The least share of other frames with a box of the same label at the same place, for a box that stays. Frames at least
+`_LATER` away with a box of the label count. Detectors miss a thing in some frames, and moving boxes come back to one place
+in few frames. With a larger share, a thing that is often missed beside others of its label does not stay."""
 _STEP = 0.25
-"""The farthest way of a box from one frame to the next, as a share of the image's width. A robot that turns by a radian a
-second moves a box by this much at 4 frames a second. A larger share takes more false boxes for things that move."""
+"""The largest distance that a box moves from one frame to the next, as a share of the image's width. A robot that turns by a
+radian a second moves a box by this share at 4 frames a second. A larger share takes more false boxes for things that
+move."""
 _FEWEST = 5
 """The fewest boxes of a label that show whether its things move."""
 _ASKED = 400
-"""The most boxes of a label that are compared with all others. They are spread evenly over the time. More take longer."""
+"""The most boxes of a label that are compared with all others, spread evenly over the time. More boxes take longer."""
 
 
 def boxes_move(log: Log, start: float, end: float) -> bool:
     """Return whether the boxes of most labels move through the image between two stamps, as if the camera moved.
 
-    A label stands if more of its boxes stay than move. It may have several things, each at its own place. A box moves if it
-    does not stay, and if a box of the image before or after is near it. So false boxes, which are somewhere else in each
-    image, do not move. Two labels must move if the log has several, because people also move past a robot that waits. All
-    cameras see the same people, so a label counts once, however many cameras see it move.
+    A label stands if more of its boxes stay than move. A label may have several things, each at its own place. A box moves
+    if it does not stay, and if the previous or the next image has a box near it. So false boxes, which are somewhere else in
+    each image, do not move. Two labels must move if the log has several, because people also move past a robot that waits.
+    All cameras see the same people, so a label counts once, however many cameras see it move.
     """
     moving, still, labels = list[str](), 0, set[str]()
     for one in log.cameras:
@@ -51,7 +53,7 @@ def boxes_move(log: Log, start: float, end: float) -> bool:
 
 
 def _stays_and_moves(boxes: Detections, step: float) -> tuple[Bools, Bools]:
-    """Return which boxes of one label (A,) stay, and which of them move. At most `_ASKED` boxes are judged.
+    """Return which boxes of one label (A,) stay, and which boxes (A,) move. At most `_ASKED` boxes are judged.
 
     step: px, the farthest way of a box from one frame to the next.
     """
