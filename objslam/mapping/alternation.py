@@ -36,16 +36,16 @@ def solve(
 ) -> Solution:
     """Find and solve the objects of a log.
 
-    In fixed mode the association runs once, at the given poses, unless the cameras are calibrated against these poses. In
-    joint mode the poses are explored first, unless the log has a localisation. Then association and solve alternate until no
-    ray changes its object. At the end, bearings may be turned to the centres of bodies. If the settings ask for it, every
-    label is one object, and nothing is associated. The joint mode also tries one object for each label if hardly any frame
-    has two boxes of one label. It keeps the result if the rays agree.
+    In fixed mode, the association runs once, at the given poses. If cameras are calibrated against these poses, it runs
+    several times. In joint mode, the poses are explored first, unless the log has a localisation. Then association and solve
+    alternate until no ray changes its object. At the end, the bearings may be turned to the centres of bodies. If the
+    settings ask for it, each label is one object, and no ray is associated. The joint mode also tries one object for each
+    label if hardly any frame has two boxes of one label. It keeps this map if its rays agree.
 
-    frames: all keyframes with a pose, also without rays. start: a known start for the keyframes with rays. With it,
-    the joint mode neither explores nor trusts labels. errors: the shared errors of the keyframes with rays. They are
-    estimated and removed from the keyframes and rays. earlier: a map of the log at its poses. SolveError if the joint mode
-    has neither odometry nor localisation.
+    frames: all keyframes with a pose, with and without rays. start: a known start for the keyframes with rays. With a start,
+    the joint mode does not explore, and does not take labels for names. errors: the shared errors of the keyframes with
+    rays. The solve estimates them and removes them from the keyframes and rays. earlier: a map of the same log at its given
+    poses. SolveError if the joint mode has neither odometry nor localisation.
     """
     keyframes, rays_of_keyframes = seen_something(frames, rays)
     trace = Trace(keyframes.base_T_camera) if settings.output.recording else None

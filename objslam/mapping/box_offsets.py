@@ -1,5 +1,6 @@
-"""Errors that the boxes of an object share. The centre of a box is off the centre of the object. From one side, all boxes
-have about the same offset. Many rays from one side do not average it out, so they count as few rays (Kish 1965)."""
+"""Add the errors that the boxes of an object share to the covariances of a map. The centre of a box lies beside the centre
+of its object. All boxes from one side have about the same offset. Many rays from one side do not average this offset out, so
+they count as few rays (Kish 1965)."""
 
 from dataclasses import dataclass, replace
 from typing import Self
@@ -18,23 +19,25 @@ from objslam.mapping.solution import Solution, as_centres
 from objslam.triangulation.bodies.shared import SIDES, WITHIN
 
 _SHARES = 81
-"""The number of values that `_variances` tries, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
+"""The number of shares that `_variances` tries, from 0 to `_WIDEST` times the prior. With a larger number, the estimate is
+more exact and slower."""
 _WIDEST = 4.0
-"""The largest share that `_variances` tries, in standard deviations of its prior. A larger value allows worse detectors."""
+"""The largest share that `_variances` tries, in standard deviations of the prior of the share. A larger value allows worse
+detectors."""
 _LOOSE = 1.0
 """The prior standard deviation (m) of the error of a solved position, in `_variances`. With a larger value, the rays decide
 more."""
 ANGLES = tuple(np.radians([10.0, 20.0, 40.0, 80.0]).tolist())
-"""The angles (rad) between two views of an object at which the errors of its boxes may have the correlation 1/2. A detector
-had 5 to 20 degrees on three objects of YCB-Video. Boxes of a thing that is wider on one side, or is lit from there, change
-more slowly. Few sides do not show such errors, and with small angles alone the boxes would look exact. Larger angles make
-positions less sure."""
+"""The angles (rad) between two views of an object at which the errors of its boxes may have the correlation 1/2. The true
+angle was 5 to 20 degrees for one detector and three objects of YCB-Video. It is larger for a thing that is wider on one
+side, or is lit from one side. A robot that sees few sides cannot measure such a large angle. With small angles alone, its
+boxes would then look exact. Larger angles make positions less sure."""
 _EXPECTED = 1 / np.array(ANGLES) / (1 / np.array(ANGLES)).sum()
-"""(A,) the prior probability of each of `ANGLES`. It falls with the angle, as the detector above says. Many objects together
-outweigh it."""
+"""(A,) the prior probability of each angle in `ANGLES`. A larger angle is less likely, because the detector above had small
+angles. The boxes of many objects together outweigh this prior."""
 _POOLED = 20.0
-"""With this many rays, the scatter of an object's own rays weighs as much as the scatter of all rays. With a larger number,
-objects differ less."""
+"""The number of rays with which the scatter of an object's own rays weighs as much as the scatter of all rays. With a larger
+number, the scatter of one object differs less from that of the others."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +45,10 @@ class Sides:
     """C sides from which one object was seen.
 
     turned: (C, C) rad, the angle between the views from two sides. mean: (C, A) rad, the mean angle by which the rays of a
-    side miss the object, along A axes (azimuth and elevation). white: (C,) rad, the standard deviation of this mean if the
-    rays err independently. shift: (C, A, 3) rad per m, the derivative of the mean by the object's position. offset: (C, A,
-    3) rad, the derivative of the mean by an offset of all boxes of the side. The offset is a share of the object's size.
-    pull: (C, 3, 3) m, the derivative of the object's position by this offset.
+    side miss the object. It has A axes: azimuth and elevation, or elevation alone. white: (C,) rad, the standard deviation
+    of this mean if the rays err independently. shift: (C, A, 3) rad per m, the derivative of the mean by the object's
+    position. offset: (C, A, 3) rad, the derivative of the mean by an offset of all boxes of the side. The offset is a share
+    of the object's size. pull: (C, 3, 3) m, the derivative of the object's position by this offset.
     """
 
     turned: Floats
@@ -56,7 +59,8 @@ class Sides:
     pull: Floats
 
     def alike(self, angle: float) -> Floats:
-        """Return the correlations (C, C) between the errors of two sides, if they are 1/2 at this angle, rad."""
+        """Return the correlations (C, C) between the errors of each two sides, if the correlation is 1/2 at an angle
+        (rad)."""
         return np.asarray(WITHIN * 0.5 ** (self.turned / angle))
 
     def in_elevation(self) -> Self:
@@ -66,11 +70,12 @@ class Sides:
 
 @dataclass(frozen=True)
 class SizedRays:
-    """R rays of boxes that show the size of their objects.
+    """R rays, each with the angular size of its object.
 
-    landmark: (R,) the object of each ray. origin, direction: (R, 3) in map. distance: (R,) m to the object. noise: (R,) rad,
-    the standard deviation of the direction. size: (R,) rad, the angular size of the object. along: (R,) 1/m, one over the
-    standard deviation of the range, 0 without a range.
+    landmark: (R,) the index of each ray's object. origin: (R, 3) m, in map. direction: (R, 3) unit vectors, in map.
+    distance: (R,) m, from the camera to the object. noise: (R,) rad, the standard deviation of the direction. size: (R,)
+    rad, the angular size of the object. along: (R,) 1/m, one over the standard deviation of the range. It is 0 without a
+    range.
     """
 
     landmark: Ints
@@ -83,15 +88,16 @@ class SizedRays:
 
 
 def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
-    """Return the solution with the errors that boxes share added to its covariances. Hidden bodies get them too.
+    """Return the solution with the errors that boxes share added to its covariances. The covariances of bodies of which a
+    part is hidden get these errors too.
 
-    The centres of an object's boxes have one offset that is equal from all sides, and one for each side. Both are a share of
-    the object's size. `rays.box_sigma` is the prior standard deviation of this share. The share is estimated from the rays
-    if `noise.rays` is true, or if `noise.rays` is auto and `rays.box_sigma` has its default value. In joint mode, the path
-    must also be planar.
+    The centre of each box is off by the sum of two offsets. One offset is equal from all sides, and the other differs from
+    side to side. Both are a share of the object's size. `rays.box_sigma` is the prior standard deviation of this share. The
+    rays give an estimate of the share if `noise.rays` is true. They also do so if `noise.rays` is auto and `rays.box_sigma`
+    has its default value. In joint mode, the path must also be planar.
 
-    A sensor that measures bearings only shows no sizes, but its objects are not points either. They get offsets of the prior
-    share of `rays.unknown_size`.
+    A sensor that measures bearings alone shows no sizes, but its objects have sizes. For these objects, the size is
+    `rays.unknown_size`, and the share is the prior one.
     """
     estimate, prior = solution.estimate, settings.rays.box_sigma
     rays = _sized_rays(solution, cameras, settings)
@@ -109,7 +115,7 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
     if learnt and joint:
         learnt = is_planar(solution.keyframes.map_T_base) and not any(noise_of_ground(settings))
     told_by = seen
-    # The centre of the box of a large thing lies beside its centre. That is no error of the detector.
+    # The box of a large thing has its centre beside the centre of the thing. That is no error of the detector.
     if learnt and not joint and (centres := as_centres(solution)) is not solution:
         plain = settings.fixed.loss == "l1"
         told_by = sides_of(_sized_rays(centres, cameras, settings), centres.estimate.positions, plain=plain)
@@ -122,7 +128,7 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
         offset = offset_covariance(sides, extent, of_share)
         covariance[j] += offset
         body = bodies[j] if bodies else None
-        if body is not None and body.behind:  # Its centre comes from the edges that are visible, so from few of them.
+        if body is not None and body.behind:  # The body's centre comes from the few visible edges.
             wider = body.covariance.copy()
             wider[:3, :3] += offset
             bodies[j] = replace(body, covariance=wider)
@@ -132,9 +138,10 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
 
 
 def expected_variances(share: float) -> Floats:
-    """Return the variances (A,) of offsets, for each of `ANGLES`, before any box is seen.
+    """Return the prior variances (A,) of offsets, one for each angle in `ANGLES`. They are squared shares of the object's
+    size.
 
-    share: the standard deviation of an offset, as a share of the size.
+    share: the standard deviation of an offset, as a share of the object's size.
     """
     return np.asarray(share**2 * _EXPECTED)
 
@@ -142,8 +149,8 @@ def expected_variances(share: float) -> Floats:
 def offset_covariance(sides: Sides, extent: Floats, variances: Floats) -> Floats:
     """Return the covariance (3, 3) m^2 that the offsets of boxes add to the covariance of an object.
 
-    extent: (2,) m, width and height of the object. variances: (A,) of the offsets, as a squared share of the size, for
-    each of `ANGLES`. Their sum is the variance of an offset.
+    extent: (2,) m, width and height of the object. variances: (A,) the variances of the offsets, one for each angle in
+    `ANGLES`, as squared shares of the size. Their sum is the variance of an offset.
     """
     alike = sum(variance * sides.alike(angle) for angle, variance in zip(ANGLES, variances.tolist(), strict=True))
     by_side = np.einsum("cik,cd,djk->ij", sides.pull, alike, sides.pull)
@@ -151,10 +158,10 @@ def offset_covariance(sides: Sides, extent: Floats, variances: Floats) -> Floats
 
 
 def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> SizedRays:
-    """Return the rays with a weight above 0 of objects with a position. `rays.unknown_size` is the size of objects in boxes
-    that do not show it.
+    """Return the rays of objects with a position, without rays of weight 0. An object has the size `rays.unknown_size` if
+    its sensor shows no sizes.
 
-    Fiducials whose corners were used are left out, because their positions do not come from boxes.
+    The rays of fiducials whose corners were used are left out, because their positions do not come from boxes.
     """
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     placed = np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(estimate.positions[:, 0])
@@ -173,10 +180,11 @@ def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
 
 
 def sides_of(rays: SizedRays, positions: Floats, *, plain: bool = False) -> dict[int, Sides]:
-    """Return the sides from which each object was seen, by the index of the object. An object without rays has no entry.
+    """Return the sides from which each object was seen. The key is the index of the object. An object without rays has no
+    entry.
 
-    positions: (N, 3) m. plain: whether the positions are the solution of Eq. 1. In Eq. 1, a ray has the inverse of its
-    standard deviation as its weight. In all other solves, its weight is the inverse of its variance.
+    positions: (N, 3) m, of the objects, in map. plain: whether the positions are the solution of Eq. 1. In Eq. 1, a ray has
+    the inverse of its standard deviation as its weight. In all other solves, its weight is the inverse of its variance.
     """
     landmark, count = rays.landmark, len(positions)
     lattice = evenly_spread(SIDES)
@@ -220,18 +228,19 @@ def sides_of(rays: SizedRays, positions: Floats, *, plain: bool = False) -> dict
 
 
 def _summed(axes: Floats, cell: Ints, weight: Floats, values: Floats) -> Floats:
-    """Return the weighted sums (C, 2, D) of values (R, 3, D) along the two axes (C, 3, 2) of each side. cell: (R,) the
-    side."""
+    """Return the weighted sums (C, 2, D) of values (R, 3, D) of rays, along the two axes (C, 3, 2) of each side. cell: (R,)
+    the side of each ray."""
     sums = np.zeros((len(axes), *values.shape[1:]))
     np.add.at(sums, cell, weight[:, None, None] * values)
     return np.einsum("cia,cid->cad", axes, sums)
 
 
 def _variances(seen: list[Sides], prior: float) -> Floats:
-    """Return how far the boxes of one side are off: the variances (A,), for each of `ANGLES`, of their share of the size.
+    """Return the estimated variances (A,) of the offsets of boxes, one for each angle in `ANGLES`. They are squared shares
+    of the size.
 
-    The mean over the posterior of the share and the angle. seen: the sides of each object. prior: the standard deviation of
-    a half-normal prior of the share (Gelman 2006).
+    The estimate is the mean over the posterior of the share and the angle. seen: the sides of each object. prior: the
+    standard deviation of a half-normal prior of the share (Gelman 2006).
     """
     shares = np.linspace(0.0, _WIDEST * prior, _SHARES)
     likelihood = np.log(_EXPECTED)[:, None] - 0.5 * (shares / prior) ** 2
@@ -243,7 +252,7 @@ def _variances(seen: list[Sides], prior: float) -> Floats:
 
 
 def _likelihood(sides: Sides, shares: Floats, angle: float) -> Floats:
-    """Return the logarithm (s,) of the likelihood of shares (s,), if errors have the correlation 1/2 at an angle, rad.
+    """Return the logarithm (s,) of the likelihood of each share (s,), if errors have the correlation 1/2 at an angle (rad).
 
     The position has an error too, so the likelihood is the restricted one (Patterson and Thompson 1971).
     """
@@ -261,7 +270,8 @@ def _likelihood(sides: Sides, shares: Floats, angle: float) -> Floats:
 
 
 def _azimuth_elevation(directions: Floats) -> Floats:
-    """Return the unit vectors (n, 3, 2) of growing azimuth and elevation, both perpendicular to the direction (n, 3).
+    """Return the two unit vectors (n, 3, 2) in which azimuth and elevation grow, at each direction (n, 3). Both are
+    perpendicular to the direction.
 
     No direction may be vertical.
     """

@@ -1,4 +1,4 @@
-"""Choose the poses and the mode of a run, where the settings leave them to the log."""
+"""Choose the poses and the mode of a run. The settings say them, or leave the choice to the log."""
 
 from dataclasses import replace
 
@@ -15,8 +15,8 @@ from objslam.frontend.localization.continued_localization import (
 from objslam.mapping.checks.finding import JUMPS
 
 _BEYOND = 0.1
-"""With the mode `auto`, the poses are solved if the odometry continues the localisation for this share of the boxes or more.
-A larger share leaves out more boxes, and spares more logs the time of a solve of the poses."""
+"""The least share of boxes for which the odometry continues the localisation, so that the mode `auto` solves the poses. A
+larger share saves the time of this solve in more logs, and leaves out more boxes."""
 _LOCALIZATION = "the localisation"
 """The name of a localisation that is left out, in the warning and in the assessment."""
 
@@ -35,15 +35,15 @@ def without_localization(ledger: Ledger, reason: str) -> None:
 
 
 def lost_localization(result: RunResult) -> bool:
-    """Return whether a localisation spoils a map by its jumps, as one that was lost for a while."""
+    """Return whether jumps of the localisation spoil the map, as if the localisation was lost for a while."""
     return any(one["name"] == JUMPS and one["spoils_positions"] for one in result.summary["wrong_input"])
 
 
 def chosen_poses(log: Log, settings: Settings) -> Log:
     """Return the log with the poses that the settings choose.
 
-    If they leave the choice to the log, a localisation that covers few boxes is left out, unless the mode is `fixed`.
-    LogError if the log lacks the chosen poses.
+    With `poses.use: auto`, a localisation that covers few boxes is left out, unless the mode is `fixed`. LogError if the log
+    lacks the chosen poses.
     """
     use = settings.poses.use
     if use == "auto":
@@ -54,7 +54,7 @@ def chosen_poses(log: Log, settings: Settings) -> Log:
 
 
 def with_mode_of(log: Log, settings: Settings) -> Settings:
-    """Return the settings with `auto` replaced by the mode that it means for a log with the chosen poses."""
+    """Return the settings with the mode that `auto` means for a log. log: with its chosen poses."""
     if settings.mode != "auto":
         return settings
     more = share_on_continuation(log, continued_by_odometry(log, settings), settings)

@@ -1,9 +1,8 @@
-"""Objects whose ranges contradict their rays.
+"""Widen the covariances of objects whose ranges contradict their rays.
 
 Rays from one side that end at different visible parts of a thing can cross far in front of it. This happens if something
-without a box hides parts of the thing, such as the posts of a doorway. A robust solve then takes all ranges of the thing for
-wrong, and the place by its rays seems sure.
-"""
+without a box hides parts of the thing, such as the posts of a doorway. A robust solve then rejects all ranges of the thing,
+and the place where its rays cross seems sure."""
 
 from __future__ import annotations
 
@@ -18,27 +17,28 @@ from objslam.core.types import Association, Keyframes, Rays
 from objslam.mapping.checks.residuals import held_rays
 
 _FEWEST = 5
-"""The fewest ranges that can contradict the rays of an object. A larger number needs more ranges."""
+"""The fewest ranges that can contradict the rays of an object. With a larger number, fewer objects are tested."""
 _SIGMAS = 2.0
-"""Ranges contradict the rays if the two places differ by more than this number of standard deviations. A larger number
-widens fewer objects."""
+"""The number of standard deviations between two places from which ranges contradict rays. One place is by the ranges, the
+other by the rays. With a larger number, fewer objects become wider."""
 _OBJECTS = 5
-"""The fewest objects with ranges that show how large the error is that the ranges of an object share. With a larger number,
-fewer logs show it."""
+"""The fewest objects from which the error that the ranges of an object share is estimated. With a larger number, more logs
+keep the error of the settings."""
 _PARALLAX = 30.0
-"""Rays that meet at a larger angle (deg) place an object by themselves. Ranges that end elsewhere are then wrong, such as
-those that end behind a table. With a larger angle, more objects become wider."""
+"""The largest angle (deg) between rays that do not place an object by themselves. Above this angle, ranges that contradict
+the rays are wrong, such as ranges to the wall behind a table. With a larger angle, more objects become wider."""
 
 
 def with_contradicting_ranges(
     objects: ObjectMap, map_T_camera: Floats, keyframes: Keyframes, rays: Rays, association: Association, weight: Floats
 ) -> ObjectMap:
-    """Return the objects with covariances that reach to the place by the ranges, if ranges and rays contradict each other.
+    """Return the objects, with wider covariances where ranges and rays contradict each other. They reach to the place by the
+    ranges.
 
-    The median difference between the ranges of an object and its distances is compared with the covariance along the view
-    and with the error that its ranges share. If it is larger, its square is added to the variance along the view. Nobody
-    knows whether rays or ranges are right. map_T_camera: (K, 4, 4) the solved poses of the cameras at the keyframes. weight:
-    (R,) 0 for a rejected ray.
+    The test is on the median difference between an object's ranges and its solved distances. This difference is compared
+    with the covariance along the view and with the error that the ranges share. If the difference is larger, its square is
+    added to the variance along the view. Nobody knows whether rays or ranges are right. map_T_camera: (K, 4, 4) the solved
+    poses of the cameras at the keyframes. weight: (R,) the weight of each ray, 0 for a rejected one.
     """
     held = np.flatnonzero(held_rays(objects, association) & (rays.range > 0) & (weight > 0))
     if not len(held):

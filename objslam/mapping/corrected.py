@@ -1,4 +1,4 @@
-"""A solution and its log without the shared errors that the solve estimated."""
+"""Remove the shared errors that a solve estimated from its log."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from objslam.mapping.solution import Solution, with_noise_of
 
 
 def corrected(solution: Solution, errors: SharedErrors, ledger: Ledger) -> tuple[Solution, Log]:
-    """Return a solution and its log without the shared errors, for example clock offsets. Warn of large errors.
+    """Return a solution and its log without the shared errors, for example clock offsets. The ledger warns of large errors.
 
     errors: the errors that the solve estimated. The returned solution also has the prior of these errors in its calibration,
     and the odometry's drift at each keyframe.

@@ -35,7 +35,7 @@ def make_result(
 ) -> RunResult:
     """Return the result of a run with its doubts, and add the assessment of its quality to the summary.
 
-    objects, residual: from `describe`. more: the fields of `RunResult` that the solution does not have.
+    objects, residual: what `describe` returns. more: the fields of `RunResult` that the solution does not have.
     """
     keyframes, rays, estimate = solution.keyframes, solution.rays, solution.estimate
     missed = misses(objects, keyframes, rays, solution.association, residual, settings)
@@ -62,7 +62,7 @@ def make_result(
 
 
 def counted_weights(association: Association, weight: Floats) -> Floats:
-    """Return the weights (R,) of rays, where only a ray that misses its object has the weight 0.
+    """Return the weights (R,) of rays. Only a ray that misses its object has the weight 0.
 
     A solve also gives the weight 0 to all rays of an object that it cannot place, for example without parallax. Such rays
     miss nothing, so they have the weight 1 here.
@@ -76,7 +76,8 @@ def counted_weights(association: Association, weight: Floats) -> Floats:
 def describe(
     solution: Solution, cameras: tuple[Camera, ...], settings: Settings, *, trusted: bool = True
 ) -> tuple[ObjectMap, Floats]:
-    """Return the map of the objects, and the angle (R,), rad, between each ray and its object, NaN without an object.
+    """Return the map of the objects, and the angle (R,) in rad between each ray and its object. The angle is NaN for a ray
+    without an object.
 
     The counts of rays and frames leave out rejected rays, unless all rays of the object are rejected. The position of an
     object with a body may be the centre of the body (`PlacedBody`). trusted: if false, all objects are unresolved.
@@ -139,7 +140,7 @@ def describe(
 
 
 def _best_view(rays: Rays, mine: Ints, image: Floats) -> Floats32 | None:
-    """Return the appearance vector (D,) of the best of the rays `mine`, None if they have none.
+    """Return the appearance vector (D,) of the best view among the rays `mine`. Return None if no ray has such a vector.
 
     The best view is the largest box that lies inside its image, or the largest box if none does. A mean of vectors would fit
     no real view. image: (R, 2) width and height of the image of each ray, px.
@@ -154,7 +155,8 @@ def _best_view(rays: Rays, mine: Ints, image: Floats) -> Floats32 | None:
 
 
 def _shared(objects: list[MapObject], estimate: Estimate) -> Floats | None:
-    """Return the covariance (7, 7) of the error that the resolved objects share, None if it is not known."""
+    """Return the covariance (7, 7) of the error that the resolved objects share (`shared_covariance`). Return None if it is
+    not known."""
     known = [j for j, o in enumerate(objects) if o.covariance is not None]
     if estimate.correlated is None or not known:
         return None
@@ -163,7 +165,7 @@ def _shared(objects: list[MapObject], estimate: Estimate) -> Floats | None:
 
 
 def _cut_off(rays: Rays) -> dict[str, int]:
-    """Return the number of boxes of each label that the image's edge cuts off, without labels that have none."""
+    """Return the number of boxes of each label that the image's edge cuts off. A label without such boxes has no entry."""
     if rays.cut is None:
         return {}
     number = np.bincount(rays.cut.label, minlength=len(rays.label_names))
@@ -171,7 +173,8 @@ def _cut_off(rays: Rays) -> dict[str, int]:
 
 
 def _label_shares(association: Association, j: int, mine: Ints, rays: Rays) -> dict[str, float] | None:
-    """Return the share of each label among the boxes of an object, and the dropped boxes on them. mine: (n,) its rays."""
+    """Return the share of each label among the boxes of an object. A second box on the same thing was dropped, but its label
+    counts. mine: (n,) the object's rays."""
     if association.label_weights is None:
         return None
     shares, names = association.label_weights[j], rays.label_names
@@ -253,7 +256,8 @@ def summarise(
 
 @cache
 def _versions() -> dict[str, str]:
-    """Return the versions of Python and of the installed packages that can change a result. They are looked up once."""
+    """Return the versions of Python and of the installed packages that can change a result. They are read once, and then
+    kept."""
     found = {"python": platform.python_version()}
     for package in ("objslam", "gtsam", "torch", "numpy", "opencv-python-headless", "open3d"):
         with suppress(importlib.metadata.PackageNotFoundError):

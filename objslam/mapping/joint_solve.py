@@ -1,4 +1,4 @@
-"""Joint mode: where the rounds of association and solve begin, and which of their results counts."""
+"""Joint mode: choose where the rounds of association and solve begin, and which of their results counts."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ if TYPE_CHECKING:
 
 
 def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
-    """Return the state after association and solve of a log. It has an association and an estimate.
+    """Return the state after association and solve of a log. The state has an association and an estimate.
 
-    If the map shows a gross error that was held, the log is solved once more, and the state has this error among its shared
-    errors. start: a known start. With it, labels are not trusted.
+    A held error is one that the solve does not estimate. If the map shows that a held error is gross, the log is solved once
+    more, and this error is estimated as a shared error. start: a known start. With a start, labels are not taken for names.
     """
     state = _begun(begin)
     if start is not None or not _may_be_names(state):
         return _associated_again(begin, state, start)
     before = state.ledger.copy()
     named = by_label(state)
-    if not named.agree:  # What a solve warned of does not matter if its map is not used.
+    if not named.agree:  # The warnings of a solve do not matter if its map is not used.
         state.ledger.restore(before)
     wider, named = _named_with_gross_errors(begin, named)
     if wider is not None:
@@ -59,15 +59,16 @@ def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
         return _with_several_a_label(state, named.state) if doubted else named.state
     if (found := _of_agreeing_labels(state, named)) is not None:
         return found
-    # The noise and the shared errors of a map that is wrong would bend the path again. So the search begins without them.
+    # The noise and the shared errors of a wrong map would bend the path again. So the search begins without them.
     return _associated_again(begin, state, None, named.state)
 
 
 def solve_names(begin: JointState) -> JointState | None:
-    """Return the state after a solve in which labels are names, all of them or those that agree with each other. None if
-    labels do not show the path.
+    """Return the state after a solve in which labels are names: all labels, or those that agree with each other. Return None
+    if labels do not show the path.
 
-    Nothing is explored, so this takes less time than `solve_joint`. Of the other labels, the state has the objects at rest.
+    Nothing is explored, so this takes less time than `solve_joint`. The state also has the objects of the other labels, if
+    they are at rest.
     """
     state = _begun(begin)
     if not _may_be_names(state):
@@ -80,8 +81,8 @@ def solve_names(begin: JointState) -> JointState | None:
 
 
 def _may_be_names(state: JointState) -> bool:
-    """Return whether to try one object for each label (`may_be_by_label`). For `auto`, the rays of most labels must not
-    diverge."""
+    """Return whether to try one object for each label (`may_be_by_label`). With the method `auto`, this needs labels whose
+    rays mostly do not diverge."""
     known = state.settings.association.method != "auto"
     return may_be_by_label(state.settings, state.all_rays) and (known or not labels_diverge(state.keyframes, state.rays))
 
@@ -89,8 +90,8 @@ def _may_be_names(state: JointState) -> bool:
 def _associated_again(
     begin: JointState, state: JointState, start: InitialEstimate | None, named: JointState | None = None
 ) -> JointState:
-    """Return the state after association and solve. If its map shows a gross error that was held, this is done again. named:
-    as in `from_several_starts`."""
+    """Return the state after association and solve. If its map shows that a held error is gross, both are repeated with this
+    error estimated. named: as in `from_several_starts`."""
     before = state.ledger.copy()
     found = _associated(state, start, named)
     wider, found = _with_gross_errors(begin, found)
@@ -101,12 +102,13 @@ def _associated_again(
 
 
 def _begun(state: JointState) -> JointState:
-    """Return the state with what a log shows before its first solve: clocks, and the noise of localised poses."""
+    """Return the state with what a log shows before its first solve: clock offsets, and the noise of localised poses."""
     return _with_noise_of_poses(_with_clocks(state))
 
 
 def _named_with_gross_errors(begin: JointState, named: Named) -> tuple[JointState | None, Named]:
-    """Return what `_with_gross_errors` returns, for the surest map of the labels."""
+    """Return what `_with_gross_errors` returns for the surest map of the labels. The second value has this map in its place
+    among `named`."""
     if named.others is not None:
         wider, solved = _with_gross_errors(begin, named.others)
         return wider, replace(named, others=solved)
@@ -118,8 +120,9 @@ def _named_with_gross_errors(begin: JointState, named: Named) -> tuple[JointStat
 
 
 def _with_gross_errors(begin: JointState, found: JointState) -> tuple[JointState | None, JointState]:
-    """Return the start of a solve that also estimates those held errors that the map of `found` shows. None if it shows
-    none. Also return `found`, whose estimate may now tell what the held errors do to it."""
+    """Return the start of a solve that also estimates the gross held errors, and return `found`. The start is None if the
+    map of `found` shows no gross error. The estimate of the returned `found` may now contain the effect of the held
+    errors."""
     if begin.errors is None or found.errors is None or found.association is None or found.estimate is None:
         return None, found
     errors = found.errors.with_noise(begin.errors.noise)
@@ -129,10 +132,10 @@ def _with_gross_errors(begin: JointState, found: JointState) -> tuple[JointState
 
 
 def _of_agreeing_labels(state: JointState, named: Named) -> JointState | None:
-    """Return the state in which the labels that agree are names, with the objects of the other labels. None if no such
-    labels show the path. state: before the solve by labels.
+    """Return the state in which the labels that agree are names. It also has the objects of the other labels. Return None if
+    no labels show the path. state: before the solve by labels.
 
-    Doubted labels of these are names too, unless there is clear evidence against it.
+    Doubted labels among those that agree are names too, unless there is clear evidence against it.
     """
     aside = state if named.doubtful is None else state.attempt()
     found = None if named.others is None else at_other_labels(aside, named.others)
@@ -142,11 +145,13 @@ def _of_agreeing_labels(state: JointState, named: Named) -> JointState | None:
 
 
 def _with_several_a_label(state: JointState, named: JointState, other: JointState | None = None) -> JointState:
-    """Return the state with several objects per label if there is clear evidence for it, else the state `named`, which has
-    one object for each label that agrees. state: before the solve by labels. other: a state without this, if there is one.
+    """Return the state with several objects per label if there is clear evidence for it. Otherwise return the state `named`,
+    which has one object for each label that agrees. state: before the solve by labels. other: the state with several objects
+    per label. If it is None, it is solved here.
 
-    A short drive may show too little for an exploration, which then finds fewer objects than there are labels, or parts of
-    one object. So labels count as names unless the other map has objects for all of them, and is far more likely.
+    A short drive may show too little for an exploration. The exploration then finds fewer objects than there are labels, or
+    splits one object into parts. So labels count as names unless the other map has objects for all labels, and is far more
+    likely.
     """
     doubted = doubted_names(named)
     try:
@@ -162,15 +167,15 @@ def _with_several_a_label(state: JointState, named: JointState, other: JointStat
 
 
 def _associated(state: JointState, start: InitialEstimate | None, named: JointState | None = None) -> JointState:
-    """Return the state after association and solve. start: a known start. Without a localisation, other starts are tried if
-    its map is unclear. named: as in `from_several_starts`."""
+    """Return the state after association and solve. start: a known start. If its map is unclear and the log has no
+    localisation, other starts are tried. named: as in `from_several_starts`."""
     if state.keyframes.localized_every:
         doubtful = begins_with_lasting_errors(state)
         found = improved(from_start(state, start), relocalized)
         state = _or_as_in_fixed_mode(state, found) if start is None else found
         if doubtful or has_lasting_errors(state):
             state = _anew(state.split())
-            if state.keyframes.odom_T_base is not None:  # It tells the motions of the path through a map without phantoms.
+            if state.keyframes.odom_T_base is not None:  # It gives the motions in a map without phantoms.
                 state = without_phantoms(state)
     else:
         state = from_several_starts(state, start, named)
@@ -179,13 +184,13 @@ def _associated(state: JointState, start: InitialEstimate | None, named: JointSt
 
 
 def _settled(state: JointState) -> JointState:
-    """Return the state after what follows the last round: a solve with all shared errors, and no objects of things that
-    move."""
+    """Return the state after the steps that follow the last round. These steps solve all shared errors, add objects from few
+    rays, and drop objects of things that move."""
     assert state.association is not None
     if state.unsettled:
         rounds, changed = state.settings.joint.max_rounds, f"{state.unsettled} of {state.association.count} objects"
         state.ledger.warn(f"the association still changes {changed} after {rounds} rounds (joint.max_rounds)")
-    if state.hold:  # The covariances now contain the shared errors, so that more pairs may be one object.
+    if state.hold:  # The covariances now contain the shared errors, so more pairs of objects may be one object.
         state = replace(state, hold=False).solve("association", state.association, state.solved_poses).merged()
     # The search for objects from few rays leaves out the rays of dropped objects.
     return without_moving_things(_with_few_rays(associated_at_rest(state)))
@@ -194,8 +199,8 @@ def _settled(state: JointState) -> JointState:
 def _with_few_rays(state: JointState) -> JointState:
     """Return the state with the objects that can be found from few rays.
 
-    Few rays hardly correct the poses before these objects are known. So the search allows for all the noise that the
-    localisation had."""
+    The rays of such objects have hardly corrected the poses yet. So the search allows for all the noise that the
+    localisation had before the solve."""
     from objslam.association.few_rays.additional_objects import add_few_ray_objects
     from objslam.association.observations import PosedRays
     from objslam.graph.fixed_pose_triangulation import flat_noise
@@ -239,12 +244,12 @@ def _with_noise_of_poses(state: JointState) -> JointState:
 def _or_as_in_fixed_mode(begin: JointState, state: JointState) -> JointState:
     """Return the better of two states: the given one, and one that begins with the association of the fixed mode.
 
-    The first association at localised poses allows for the noise of the localisation, but not for the errors of cameras. Its
-    gates may be too wide for rows of equal things. They may be too narrow for a camera that is mounted askew, or for a
-    localisation that errs for seconds. Then an object has rays of two things. The later rounds keep these rays, because the
-    poses were bent to fit them. The fixed mode calibrates the cameras, and finds the noise of the poses in the boxes of each
-    frame. The association of an earlier map at the poses is taken, if there is one. begin: before the first association.
-    state: after the rounds that began there.
+    The first association at localised poses allows for the noise of the localisation, but not for the errors of cameras. The
+    gates of this association may be too wide for rows of equal things. They may be too narrow for a camera that is mounted
+    askew, or for a localisation that errs for seconds. Then an object has rays of two things. The later rounds keep these
+    rays, because the poses were bent to fit them. The fixed mode calibrates the cameras, and finds the noise of the poses in
+    the boxes of each frame. If there is an earlier map at the given poses, its association is used. begin: before the first
+    association. state: after the rounds that began there.
     """
     if begin.errors is None:
         return state
@@ -260,9 +265,11 @@ def _or_as_in_fixed_mode(begin: JointState, state: JointState) -> JointState:
 
 
 def _anew(state: JointState) -> JointState:
-    """Return the state after rounds that begin without an association, at the solved poses, if they explain the log better.
+    """Return the better of two states: the given one, and one after rounds that begin at its solved poses without an
+    association. The given state is better if it explains the log better.
 
-    The first association was at poses that err. The rounds keep its objects as long as they have enough rays."""
+    The first association was at poses that err. The rounds keep the objects of this association while these have enough
+    rays."""
     assert state.estimate is not None
     attempt = replace(state.attempt(), association=None)
     return state.better(attempt.alternated(state.estimate.map_T_base, None))

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PriorMap:
-    """The map of another day. name: as shown in messages. objects: in the frame of that map. up: the axis of that frame that
-    points up."""
+    """The map of another day. name: the name in messages. objects: the objects, in the frame of that map. up: the axis of
+    that frame that points up."""
 
     name: str
     objects: ObjectMap
@@ -40,17 +40,18 @@ class PriorMap:
 
     @property
     def first_free_id(self) -> int:
-        """The largest id in the map plus 1, including objects that are gone."""
+        """The largest id in the map plus 1. Objects that are gone count too."""
         return max((o.id for o in (*self.objects.objects, *self.objects.gone)), default=-1) + 1
 
 
 @dataclass(frozen=True)
 class Localization:
-    """A drive in the frame of an older map, or the reason why it is not there.
+    """A drive in the frame of an older map, or the reason why the drive was not found in the map.
 
-    registration: the match of the drive's objects to the map's. told: the entry of summary.json. The other fields are None
-    for a drive that was not found. solution: the drive in the frame of the map, with objects positioned by rays alone.
-    positions, covariance: (N, 3) m and (N, 3, 3) m^2 of the objects by rays and map together. map_T_drive: (4, 4).
+    registration: the match of the drive's objects to the objects of the map. told: the entry `localisation` of summary.json.
+    The other fields are None for a drive that was not found. solution: the drive in the frame of the map. Its objects are
+    positioned by the drive's rays alone. positions, covariance: (N, 3) m and (N, 3, 3) m^2, the objects by rays and map
+    together. map_T_drive: (4, 4), takes points from the frame of the drive to that of the map.
     """
 
     registration: Registration
@@ -67,7 +68,7 @@ def localize(
     """Register a drive to an older map, and solve it once more with the matched objects as priors.
 
     objects: the map of the drive. known: the older map. errors: the shared errors of the drive, None if none were estimated.
-    If the registration is refused, or the solve fails, the ledger gets a warning, and the drive stays in its own frame.
+    The drive stays in its own frame if the registration is refused or the solve fails. The ledger then gets a warning.
     """
     # This module imports scipy.optimize, and that import takes longer than the whole map of a small log.
     from objslam.association.registration.object_maps import placed, reason, register
@@ -111,7 +112,7 @@ def localize(
 
 
 def _with_covariances(solution: Solution, objects: ObjectMap) -> Solution:
-    """Return the solution with the covariances of its map. Checks of the result may have widened them."""
+    """Return the solution with the covariances of `objects`, which checks of the map may have widened."""
     widened = objects.covariances
     covariance = np.where(np.isfinite(widened), widened, solution.estimate.covariance)
     return replace(solution, estimate=replace(solution.estimate, covariance=covariance))
@@ -150,7 +151,7 @@ def _solve(
             noise = errors.noise if estimate.noise is None else estimate.noise
             images = errors.keyframes
             keyframes, rays, settings = errors.with_noise(noise).at(estimate.calibration.values)
-            rays = replace(rays, direction=solution.rays.direction)  # They may point to centres of bodies.
+            rays = replace(rays, direction=solution.rays.direction)  # These may point to centres of bodies.
         rays = share_bias(rays, solution.association)
         measured = Measurements.of(keyframes, rays, settings, Multiframes.of(images))
     resolved = np.array(there, dtype=np.int64)
@@ -168,7 +169,7 @@ def describe_in_map(
 ) -> tuple[Solution, ObjectMap, Floats]:
     """Return the solution of a drive in the frame of the map, its objects, and the residuals (R,), rad, of its rays.
 
-    ids: (N,) the ids of the objects in the drive. trusted: whether positions are reliable.
+    ids: (N,) the ids of the objects in the drive. trusted: if false, all objects are unresolved.
     """
     assert where.solution is not None
     solution = with_bodies(where.solution, cameras, settings)
@@ -178,16 +179,16 @@ def describe_in_map(
 
 
 def at_ray_points(objects: ObjectMap) -> ObjectMap:
-    """Return a map in which the position of each object is the point where its rays meet, never the centre of its body."""
+    """Return the map with each object at the point where its rays meet, instead of at the centre of its body."""
     found = (o if o.ray_point is None else replace(o, position=o.ray_point) for o in objects.objects)
     return replace(objects, objects=tuple(found))
 
 
 def with_map(objects: ObjectMap, where: Localization, known: PriorMap) -> ObjectMap:
-    """Return the objects of a drive with the ids of the map, and at the positions in `where`.
+    """Return the objects of a drive with the ids of the older map, at the positions in `where`.
 
-    objects: of the drive, in the frame of the map. An object without a covariance keeps its position. An object that the map
-    does not have gets the first free id of the map plus its id in the drive.
+    objects: the objects of the drive, in the frame of the map. An object without a covariance keeps its position. An object
+    that the map does not have gets the first free id of the map plus its id in the drive.
     """
     assert where.positions is not None
     assert where.covariance is not None
@@ -199,7 +200,7 @@ def with_map(objects: ObjectMap, where: Localization, known: PriorMap) -> Object
         if item.covariance is None:
             moved.append(replace(item, id=number))
             continue
-        point = where.positions[j]  # The point where its rays meet.
+        point = where.positions[j]  # The point where the object's rays meet.
         position = point if item.ray_point is None else point + item.position - item.ray_point
         ray_point = None if item.ray_point is None else point
         moved.append(replace(item, id=number, position=position, covariance=where.covariance[j], ray_point=ray_point))

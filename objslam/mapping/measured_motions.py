@@ -11,9 +11,10 @@ _TRANSLATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
 
 
 def motions_of(result: RunResult) -> Motions | None:
-    """Return the motions by odometry between the poses of trajectory.txt. Their covariances have the translation first.
+    """Return the motions by odometry between the poses of trajectory.txt, or None if the run used no odometry, as in fixed
+    mode.
 
-    The result is None if the run used no odometry, as in the fixed mode.
+    Their covariances (6, 6) have the translation (m) first, then the rotation (rad).
     """
     from objslam.graph.factors.odometry import motions
 

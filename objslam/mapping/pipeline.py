@@ -28,15 +28,21 @@ def run(
 ) -> RunResult:
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
-    With mode `auto`, a log whose localisation errs for seconds (`check_lasting_noise`) is solved once more in joint mode, if
-    it has odometry too, or if the settings leave the noise of the localisation open. So is a log with most objects doubtful
-    at the localised poses. A log with odometry is solved once more, too, in three cases. Its localisation errs by more than
-    the settings say (`check_pose_noise`). No object has a place at the localised poses. Or its map is not good, and the
-    odometry shows that the localisation errs for seconds (`odometry_contradicts`). If jumps of the localisation spoil the
-    map, a log with odometry is mapped by it alone. known: the map of another day. If the drive is found in it, the result is
-    in its frame, and its objects count as priors. LogError if the log lacks the chosen poses, if its stamps have different
-    units, or if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong
-    or does not fit the log.
+    With mode `auto`, some logs are first mapped at their localised poses, and then solved once more in joint mode. A log
+    without odometry needs settings that leave the noise of the localisation open, and one of the first two reasons. A log
+    with odometry needs one of five reasons:
+
+    - The localisation errs for seconds (`check_lasting_noise`).
+    - Most objects are doubtful at the localised poses.
+    - The localisation errs by more than the settings say (`check_pose_noise`).
+    - No object has a place at the localised poses.
+    - The map is not good, and the odometry shows that the localisation errs for seconds (`odometry_contradicts`).
+
+    If jumps of the localisation spoil the map, a log with odometry is mapped by its odometry alone. If a joint solve fails,
+    the log is mapped at its localised poses. known: the map of another day. If the drive is found in this map, the result is
+    in the map's frame, and the map's objects count as priors. LogError if the log lacks the chosen poses, if its stamps have
+    different units, or if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if
+    calibration.file is wrong or does not fit the log.
     """
     before = ledger.copy()
     try:
@@ -81,8 +87,9 @@ def _run(
     known: PriorMap | None,
     earlier: MapAtPoses | None = None,
 ) -> tuple[RunResult, str, MapAtPoses]:
-    """Map the objects of a log as `run` does, in one mode. Also return why given poses seem to be wrong, "" if they do not.
-    The third value is what the map tells a joint solve, if it is at the given poses. earlier: this of an earlier map."""
+    """Map the objects of a log as `run` does, in one mode. The second value says why the given poses seem to be wrong. It is
+    "" if they do not. The third value is what a map at given poses tells a joint solve. earlier: the third value of an
+    earlier call."""
     drive, seconds = Drive.of(log, settings, ledger), dict[str, float]()
     with stage("load", seconds, progress):
         load_libraries()  # Loading is a stage of its own, because it takes longer than a small solve.
@@ -106,7 +113,7 @@ def _run(
 
 
 def _doubting(progress: Progress, drive: Drive) -> Progress:
-    """Return a progress function that also names the findings about the input, if a test after the solve may refute them."""
+    """Return a progress function that also names the findings about the input if a test after the solve may refute these."""
     if not drive.refutable:
         return progress
     names = ", ".join(finding.name for finding in drive.diagnosis.findings)
@@ -114,5 +121,5 @@ def _doubting(progress: Progress, drive: Drive) -> Progress:
 
 
 def _of_poses_too(progress: Progress) -> Progress:
-    """Return a progress function that says that the stages are those of the second solve."""
+    """Return a progress function that marks each stage as one of the second solve."""
     return lambda stage, done, total: progress(f"poses too, {stage}", done, total)

@@ -31,13 +31,13 @@ from objslam.mapping.progress import Progress
 
 _BLOCK = 6
 """The number of voxels along the edge of a block. Compared with 8, a value of 6 takes a tenth less time and a quarter less
-memory. A larger number is slower: 16 takes twice the time."""
+memory. With a larger number, the fusion is slower. With 16, it takes twice the time."""
 _FIRST_BLOCKS = 32_768
-"""At first, the grid has memory for this number of blocks, enough for one room of a house. A full grid doubles its memory. A
-larger number takes more memory in a small scene."""
+"""The number of blocks for which a new grid has memory. It is enough for one room of a house. A full grid doubles its
+memory. A larger number takes more memory in a small scene."""
 _SPARE = 1024
-"""The number of blocks in the grid that always stay free. Open3D would enlarge a grid on its own, past the limit, if one
-call touches more blocks than are free. A larger number takes more memory."""
+"""The number of blocks that always stay free in the grid. If one call touched more blocks than are free, Open3D would
+enlarge the grid, even beyond `reconstruction.max_blocks`. A larger number takes more memory."""
 _AHEAD = 4
 """The number of images that are decoded ahead. A larger number takes more memory."""
 _TOUCH = 4
@@ -47,7 +47,8 @@ these pixels is dropped. A larger step would drop images that Open3D can use."""
 
 @dataclass(frozen=True)
 class Shot:
-    """A depth image to fuse. camera: its index. rgb: the colour image, None without colour. map_T_camera: (4, 4)."""
+    """A depth image to fuse. camera: the index of its camera. depth: the file of the depth image. rgb: the file of the
+    colour image, None without colour. map_T_camera: (4, 4) the pose of the camera."""
 
     camera: int
     depth: Path
@@ -58,11 +59,12 @@ class Shot:
 def reconstruct(
     log: Log, path: Trajectory, settings: Settings, ledger: Ledger, progress: Progress = lambda stage, done, total: None
 ) -> Surface | None:
-    """Fuse the depth images of a log into a surface. None, with a warning in the ledger, if there is no surface.
+    """Fuse the depth images of a log into a surface. If there is no surface, return None, and warn in the ledger.
 
-    A pixel of a depth image is the z coordinate in the camera frame. path: the poses map_T_base. The ledger counts unused
-    depth images: without a pose, without a colour image within 20 ms, without depth up to reconstruction.max_depth, damaged,
-    or of another size than the camera's. Blocks beyond reconstruction.max_blocks are left out with a warning.
+    A pixel of a depth image is the z coordinate in the camera frame. path: the poses map_T_base. The ledger counts the depth
+    images that are not used. These have no pose, no colour image within 20 ms, or no depth up to reconstruction.max_depth.
+    Or they are damaged, or have not the size of the camera's images. Blocks beyond reconstruction.max_blocks are left out
+    with a warning.
     """
     shots = choose_shots(log, path, settings, ledger)
     if not shots:
@@ -79,10 +81,11 @@ def reconstruct(
 
 
 def choose_shots(log: Log, path: Trajectory, settings: Settings, ledger: Ledger) -> list[Shot]:
-    """Choose depth images that have a pose, in the order of time. If all cameras have colour, they also need a colour image.
+    """Return the depth images to fuse, in the order of time. Each has a pose. If all cameras have colour, each also has a
+    colour image.
 
-    Of these images, one in reconstruction.stride is taken. If these are more than reconstruction.max_frames, images at even
-    intervals are used.
+    One image in reconstruction.stride is taken. If more than reconstruction.max_frames are taken, images at even intervals
+    among them are used.
     """
     chosen = settings.reconstruction
     colour = all(c.rgb is not None for c in log.cameras if c.depth is not None)
@@ -179,7 +182,8 @@ def load_shot(
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
     """Return the undistorted depth (H, W), m, and the undistorted RGB image (H, W, 3) in [0, 1] of a shot.
 
-    Depth beyond `max_depth` is 0. Both are None if one of the two images cannot be used. Without colour, RGB is None.
+    Depth beyond `max_depth` (m) is 0. If one of the two images cannot be used, both results are None. If the shot has no
+    colour image, the RGB image alone is None.
     """
     raw = read_depth(shot.depth, camera, ledger)
     if raw is None:
@@ -204,7 +208,7 @@ def load_shot(
 class Grid:
     """A voxel block grid that grows up to reconstruction.max_blocks blocks. A voxel takes 20 bytes (8 without colour).
 
-    left_out: how many blocks the grid had no room for. A block counts again for each image that touches it.
+    left_out: the number of blocks for which the grid had no room. A block counts once for each image that touches it.
     """
 
     def __init__(self, settings: Settings, *, coloured: bool) -> None:
@@ -231,7 +235,8 @@ class Grid:
         return int(self._grid.hashmap().size())
 
     def add(self, depth: NDArray[np.float32], colour: NDArray[np.float32] | None, matrix: Floats, pose: Floats) -> None:
-        """Fuse depth (H, W), m, and colour (H, W, 3) in [0, 1] of a pinhole camera at the pose map_T_camera (4, 4)."""
+        """Fuse a depth image (H, W), m, and a colour image (H, W, 3) in [0, 1] of a pinhole camera. matrix: (3, 3) of the
+        camera, px. pose: (4, 4) map_T_camera."""
         tensor, image_of = self._core.Tensor.from_numpy, self._geometry.Image
         images = [image_of(tensor(image)).to(self._device) for image in (depth, colour) if image is not None]
         # Open3D rounds a pixel position down. With half a pixel added, it takes the nearest pixel.
@@ -243,8 +248,8 @@ class Grid:
             self._grid.integrate(part, *images, *[k] * len(images), camera_T_map, *reach)
 
     def _with_room(self, touched: Any) -> Iterator[Any]:
-        """Yield the touched blocks (M, 3) that exist or still fit, in portions for which Open3D does not enlarge the
-        grid."""
+        """Yield the touched blocks (M, 3) that exist or still fit. Each portion is small enough that Open3D does not enlarge
+        the grid."""
         hashmap = self._grid.hashmap()
 
         def room() -> int:

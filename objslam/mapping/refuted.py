@@ -1,9 +1,8 @@
 """Remove findings about wrong input that a joint solve refutes.
 
-A finding comes from a quick check before the solve (`mapping/checks`). The check keeps odometry and calibration fixed within
-windows of some seconds. So it also reports errors that the joint solve corrects, such as a camera that is turned by some
-degrees and late by 0.1 s. Therefore the test is repeated on the solved map.
-"""
+A finding comes from a quick check before the solve (`mapping/checks`). The check takes odometry and calibration as exact
+within windows of some seconds. So the check also reports errors that the joint solve corrects, such as a camera that is
+turned by some degrees and late by 0.1 s. This module therefore tests each finding again on the solved map."""
 
 from dataclasses import replace
 
@@ -32,48 +31,51 @@ from objslam.mapping.progress import Progress
 from objslam.mapping.solution import Solution, seen_something
 
 _EXPLAINED = 0.85
-"""A solve explains the boxes if at least this share of the rays in each half of a log agrees with its objects. A larger
-share refutes fewer findings. Clean simulated logs have at least 0.92, logs with one of 20 faults at most 0.76."""
+"""The least share of rays that agree with their objects, in each half of a log, for a solve that explains the boxes. A
+larger share refutes fewer findings. Clean simulated logs have at least 0.92, logs with one of 20 faults at most 0.76."""
 _NOISE = 2.0
-"""The largest noise of rays and odometry, as a multiple of the settings, in a solve that explains the boxes. With more
-noise, wrong boxes fit too. Larger values refute more findings. Corrected simulated logs have at most 1.6."""
+"""The largest noise of rays and odometry in a solve that explains the boxes, as a multiple of the noise in the settings.
+With more noise, wrong boxes fit too. A larger value refutes more findings. Corrected simulated logs have at most 1.6."""
 _MORE = 0.05
-"""A finding stands only if a solve without the fault explains more rays, by this share of all rays. A larger share refutes
-more findings."""
+"""The share of all rays by which a solve without the fault must explain more, so that a finding stands. A larger share
+refutes more findings."""
 _QUIETER = 0.5
-"""If a solve explains the boxes only with much noise, a finding stands if the corrected log needs at most this share of that
-noise. A larger share refutes fewer findings. Examples are logs of an MRCLAM robot with a fault. If the images were mirrored,
-the corrected log needs 0.17 of the noise, because with the fault the path must turn the other way. If base_T_camera was the
-identity, it needs 0.15 of the noise, which is still 2.9 times the noise in the settings."""
+"""The largest share of a solve's noise that the corrected log may need, so that a finding stands. It counts if the solve
+explains the boxes only with much noise. A larger share refutes fewer findings. Two logs of an MRCLAM robot with a fault are
+examples. In one, the images were mirrored, so that the path must turn the other way. The corrected log needs 0.17 of the
+noise. In the other, base_T_camera was the identity. The corrected log needs 0.15 of the noise, which is still 2.9 times the
+noise in the settings."""
 _USUAL_NOISE = 1.1
-"""With at most this factor on the noise of rays and odometry, a solve shows no other lens. Simulated logs whose boxes have
-another lens have 1.3 to 2.1 or far more, and right logs at most 1.0. A larger factor saves more solves, and finds fewer
-mistakes."""
+"""The largest factor on the noise of rays and odometry at which a solve shows that the lens is right. The factor is 1.3 to
+2.1, or far more, in simulated logs whose boxes have another lens. It is at most 1.0 in right logs. A larger factor saves
+more solves, and finds fewer wrong lenses."""
 _SHARPER, _QUIETER_LENS = 1.0, 0.75
-"""With another lens, rays must have at most the first share of their noise, and the larger of the noise of rays and odometry
-must be at most the second share of what it was. In 18 simulated logs, the right lens has 0.4 to 1.0, and 0.2 to 0.9. A wrong
-lens has 1.1 or more in both. Larger shares accuse more lenses."""
+"""The largest shares of the noise that may be left with another lens, so that the other lens counts as the right one. The
+first share is of the noise of rays. The second is of the larger one of two noises: that of rays and that of odometry. In 18
+simulated logs, the right lens has 0.4 to 1.0 and 0.2 to 0.9. A wrong lens has 1.1 or more in both. With larger shares, more
+lenses count as wrong."""
 _IN_BOTH = 0.55
-"""The halves of a log agree if at least this share of their rays belongs to common objects. Common objects are seen in both
-halves. The share is among the explained rays of each half (`seen_in_both`). A larger share refutes fewer findings. Clean
-simulated logs have 0.63 and more. 32 logs of two recordings have at most 0.49 if the noise of rays is usual and similar
-shares of both halves are explained. The largest shares are from logs with one label, where a bent path fits more objects by
-chance."""
+"""The least share of rays on common objects in two halves of a log that agree. Common objects are seen in both halves. The
+share is among the explained rays of each half (`seen_in_both`). A larger share refutes fewer findings. Clean simulated logs
+have 0.63 and more. 32 logs were each put together from two recordings. They have at most 0.49 if the noise of rays is usual
+and similar shares of both halves are explained. The largest shares are from logs with one label, where a bent path fits more
+objects by chance."""
 
 _OF_RANGES = ("odometry.scale", "range_scale", "range_offset", "surface")
-"""The shared errors that would explain ranges in a wrong scale. A test of this scale must not take them out."""
+"""The names of the shared errors that would explain ranges in a wrong scale. The test of this scale must not take these
+errors out."""
 
 
 def with_known_labels(diagnosis: Diagnosis, log: Log, rays: Rays, settings: Settings, progress: Progress) -> Settings:
-    """Return settings for the solve. If the log with a suspected fault corrected shows that labels are names, the settings
-    say so.
+    """Return the settings for the solve. They say that labels are names if the log shows this after a suspected fault is
+    corrected.
 
     rays: of the unchanged log.
 
-    With wrong input, the rays of a label agree on no object, and a solve then doubts the labels and associates the boxes
+    With wrong input, the rays of a label agree on no object. A solve then doubts the labels, and associates the boxes
     without them. For a real robot of 15 minutes whose base_T_camera was inverted, this took 18 minutes, and found nothing.
-    The corrected log is solved with one object for each label, which takes seconds. If this explains its boxes, the labels
-    are names, also in the given log.
+    So the corrected log is solved with one object for each label, which takes seconds. If this solve explains the boxes,
+    labels are names in the given log too.
     """
     findings = {one.name for one in diagnosis.findings if one.spoils and one.basis == "boxes"}
     named = [t.hypothesis for t in diagnosis.trials if t.hypothesis is not None and t.hypothesis.name in findings]
@@ -89,19 +91,19 @@ def with_known_labels(diagnosis: Diagnosis, log: Log, rays: Rays, settings: Sett
 def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress) -> Diagnosis:
     """Return the diagnosis of a log without the findings about boxes that a joint solve refutes.
 
-    solution: the solution of the unchanged log. A solution explains boxes only if it finds about the noise of rays that the
-    settings say.
+    solution: the solution of the unchanged log. A solution explains boxes only if the noise of rays that it finds is at most
+    `_NOISE` times the noise in the settings.
 
     The test of a finding depends on its basis:
 
-    - "boxes": the finding is wrong if the solution explains the boxes without noisy odometry. If it does not, the log is
-      solved again without the fault, and `_refuted` compares the two solutions.
+    - "boxes": the finding is wrong if the solution explains the boxes without noisy odometry. Otherwise the log is solved
+      again without the fault, and `_refuted` compares the two solutions.
     - "halves": the finding is wrong if the solution explains the boxes of both halves, or if both halves have the same
       objects.
     - "frames": the finding is wrong if the solution explains similar shares of the rays in all frames.
     - "lens": the finding is wrong if a solve with the other lens does not need far less noise of rays.
-    - "ranges": the finding is wrong if the ranges fit the odometry once the errors of clocks, turns and mounts that the
-      solution has found are taken out of the log.
+    - "ranges": the solution has errors of clocks, turns and mounts. The finding is wrong if the ranges fit the odometry
+      after these errors are taken out of the log.
     """
     kept = tuple(
         one
@@ -116,13 +118,13 @@ def _refuted(
 ) -> bool:
     """Return whether a finding is wrong, as `without_refuted` says.
 
-    This is how the solution is compared with the solution of the log without the fault, for the basis "boxes":
+    For the basis "boxes", the first solution is that of the log, and the second is that of the log without the fault:
 
-    - If the second one does not explain the boxes, the solves show nothing. The finding stands if the quick check is clear.
-    - If both explain the boxes, the first one with noisy odometry, the finding stands if the second one needs far less
-      noise.
-    - If only the second one explains the boxes, the finding stands if it explains clearly more rays, and if its noise is
-      either near the settings or far less than that of the first one.
+    - If the second solution does not explain the boxes, the solves show nothing. The finding then stands if the quick check
+      is clear.
+    - If both solutions explain the boxes, the finding stands if the second one needs far less noise.
+    - If only the second solution explains the boxes, it must explain clearly more rays than the first. Its noise must also
+      be near the settings, or far less than that of the first. Then the finding stands.
     """
     quiet = _noise(solution, rays_only=True) <= _NOISE
     if finding.basis == "frames":
@@ -133,7 +135,7 @@ def _refuted(
         return not _other_lens(diagnosis, solution, log, settings, progress)
     explained = quiet and _least_explained(solution) >= _EXPLAINED
     if finding.basis == "halves":
-        # With rounds of association, an object may be in the map twice, once for each half.
+        # After rounds of association, an object may be in the map twice, once for each half.
         return (explained and not solution.rounds) or (quiet and _halves_agree(solution))
     loud = _noise(solution) > _NOISE
     if explained and not loud:
@@ -147,7 +149,7 @@ def _refuted(
     except ObjslamError:
         return unclear
     if not _fits(other):
-        return unclear  # A solve may miss right boxes too, as when it takes two things for one. It is then no evidence.
+        return unclear  # A solve may also fail at right boxes, for example if it takes two things for one.
     quieter = _noise(other) <= _QUIETER * _noise(solution)
     if explained:  # A path that is free to bend explains boxes of a mirrored image too.
         return not quieter
@@ -157,7 +159,7 @@ def _refuted(
 
 
 def _other_lens(diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress) -> bool:
-    """Return whether the boxes of a log have another lens than the log says, as a solve with that lens shows."""
+    """Return whether a solve with the suspected other lens shows that the boxes of a log have this lens."""
     named = next(t.hypothesis for t in diagnosis.trials if t.hypothesis is not None and t.hypothesis.name == LENS)
     if _noise(solution) <= _USUAL_NOISE:
         return False
@@ -198,13 +200,14 @@ def _late(solution: Solution) -> Bools:
 
 
 def _least_explained(solution: Solution) -> float:
-    """Return the smaller of two shares: the shares of explained rays in the halves of the log."""
+    """Return the share of explained rays in that half of the log where it is smaller."""
     explained, late = _explained(solution), _late(solution)
     return float(min(explained[mask].mean() if mask.any() else 0.0 for mask in (late, ~late)))
 
 
 def _noise(solution: Solution, *, rays_only: bool = False) -> float:
-    """Return the largest factor on the noise of rays and odometry (only of rays if `rays_only`)."""
+    """Return the largest factor on the noise of rays and odometry. With `rays_only`, return the factor on the noise of
+    rays."""
     found = solution.estimate.noise
     if found is None:
         return 1.0
@@ -212,7 +215,8 @@ def _noise(solution: Solution, *, rays_only: bool = False) -> float:
 
 
 def _ranges_differ(log: Log, solution: Solution, settings: Settings) -> bool:
-    """Return whether the scales of ranges and odometry differ, without the other shared errors that the solution has."""
+    """Return whether the scales of ranges and odometry differ after the other shared errors of the solution are taken
+    out."""
     found = solution.estimate.calibration
     if found is None:
         return True

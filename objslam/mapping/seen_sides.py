@@ -7,12 +7,12 @@ from objslam.core.geometry import evenly_spread
 from objslam.core.object_map import SeenFrom
 from objslam.core.statistics import grouped_sums
 
-_SIDES = 103  # The number of sides of an object, evenly over the sphere, 20 degrees apart. A larger number is finer.
+_SIDES = 103  # The number of sides of an object, 20 degrees apart on the sphere. With a larger number, sides are narrower.
 
 
 def seen_from(position: Floats, origins: Floats) -> SeenFrom:
-    """Return the distances and directions from which cameras at origins (n, 3), m, detected an object at a position (3,),
-    m."""
+    """Return the distances and directions from which cameras detected an object. position: (3,) m, of the object. origins:
+    (n, 3) m, of the cameras."""
     toward = origins - position
     distance = np.linalg.norm(toward, axis=1)
     sides = thinned(toward / np.maximum(distance, 1e-9)[:, None])

@@ -22,36 +22,39 @@ if TYPE_CHECKING:
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
 _CLEAR = 0.98
-"""The least share of agreeing rays of a clear map, among the rays of tracks. With a larger share, more logs are tried from
-other starts, which takes time. Of 15 simulated robots, right maps had 0.983 and more, and most maps with doubles at most
-0.963. A bent map of a real robot, with ranges, had 0.976."""
+"""The least share of agreeing rays in a clear map, among the rays of tracks. With a larger share, more logs are tried from
+other starts, which takes time. In 15 simulations, right maps had 0.983 and more. Most maps that showed things twice had at
+most 0.963. A bent map of a real robot with ranges had 0.976."""
 _NOISIER = 1.5, 2.5
 """The largest factors on the noise of rays of a clear map. The first factor is for a map that only one start found. The
-second is for a map that another start found too. Rays with wrong objects make the noise large: the factor was 3.6 and 12 in
-simulated maps with doubles. Boxes that lie beside their things by a share of the size of the thing make it large too: the
-factor was 1.5 to 1.8 in right maps. With smaller factors, more logs are tried from other starts."""
+second is for a map that another start found too. Rays with wrong objects make the noise large. The factor was 3.6 and 12 in
+simulated maps that showed things twice. Boxes that lie beside their things, by a share of the thing's size, also make the
+noise large. With such boxes, the factor was 1.5 to 1.8 in right maps. With smaller factors, more logs are tried from other
+starts."""
 
 _AT_REST = 0.9
-"""If the map of a known start has objects for less than this share of the boxes of tracks, the others show things that move.
-Other starts would make objects of these. A wrong path makes objects of their own for boxes that do not fit, so this says
-nothing against the path. Wrong maps of a simulated drive had 0.96 and more, and right maps with people who walk 0.8 and
-less. With a smaller share, more logs are tried from other starts."""
+"""The least share of the boxes of tracks that have an object in a map without many moving things. Below it, the boxes
+without an object show things that move. Other starts would then make objects of such boxes. A small share says nothing
+against the path of a known start, because on a wrong path the boxes that do not fit become additional objects. Wrong maps of
+a simulated drive had 0.96 and more. Right maps with people who walk had 0.8 and less. With a smaller share, more logs are
+tried from other starts."""
 
 _HOPELESS = 0.2
-"""A start is not searched at last if its first map explains less than the best map does, by more than this share. In
-simulated logs, searches raised what first maps explain by at most 13 %. With a larger share, more starts are searched."""
+"""The largest share by which the first map of a start may explain less than the best map, so that the start is still
+searched at the end. In simulated logs, searches raised what first maps explain by at most 13 %. With a larger share, more
+starts are searched."""
 
 
 def from_several_starts(
     state: JointState, known: InitialEstimate | None = None, named: JointState | None = None
 ) -> JointState:
-    """Return the state after a search from a known start, then from the first exploration, and then from the best of further
-    starts, until the map is clear.
+    """Return the state after searches from several starts. The search ends at the first clear map. The order is a known
+    start, the first exploration, and then the best of further starts.
 
     A search for a more likely path takes many solves, and ends after `joint.max_solves`. So a further start is searched at
-    once only if its first map explains the log better than the first maps of all earlier starts. The others are searched at
-    last, and first the one that explains most: a start may be poor and still lead to the best map. state: before the first
-    association. named: the state with one object for each label, if this was tried.
+    once only if its first map explains the log better than the first maps of all earlier starts. The other starts are
+    searched at the end, because a poor start may lead to the best map. The one that explains most comes first. state: before
+    the first association. named: the state with one object for each label, if this was tried.
     """
     state = replace(state, effort=Effort())
     found = None
@@ -72,7 +75,7 @@ def from_several_starts(
 
 def _from_explorations(state: JointState, found: _Found | None, named: JointState | None) -> JointState:
     """Return the state after a search from the first exploration, and from further starts while the map is unclear. found:
-    with a known start."""
+    what a known start led to, None without one."""
     begin, path = with_errors_of_tracks(state)
     start, sure = explored(begin)
     first = from_start(*solved_if_sure(begin, start, sure))
@@ -102,8 +105,9 @@ def _from_explorations(state: JointState, found: _Found | None, named: JointStat
 
 @dataclass(frozen=True)
 class _Found:
-    """What the starts of a search led to. first: the best first map of a start. state: the best map after a search. left:
-    the first maps that are not searched yet. confirmed: whether another start led to the objects of `state`."""
+    """What the starts of a search led to. first: the best of the first maps, one of each start. state: the best map after a
+    search. left: the first maps from which no search was made yet. confirmed: whether another start led to the objects of
+    `state`."""
 
     first: JointState
     state: JointState
@@ -116,13 +120,14 @@ class _Found:
         return _unclear(self.state, self.confirmed)
 
     def compared(self, other: JointState | None) -> Self:
-        """Return what is found, and whether another map has the same objects."""
+        """Return what is found, confirmed if another map has the same objects."""
         if other is None or other.association is None or len(other.rays) != len(self.state.rays):
             return self
         return replace(self, confirmed=self.confirmed or finds_same_objects(self.state, other.association))
 
     def beside(self, first: JointState) -> Self:
-        """Return what is found with a search from another first map. Both maps are right if they have the same objects."""
+        """Return what is found after a search from another first map. If both maps have the same objects, the best map is
+        confirmed."""
         state = _searched(first)
         assert self.state.association is not None
         same = finds_same_objects(state, self.state.association)
@@ -130,9 +135,11 @@ class _Found:
         return replace(self, first=first.better(self.first), state=state.replaced(best), confirmed=same)
 
     def after(self, start: Callable[[], JointState]) -> Self:
-        """Return what is found with one more start. It is searched only if its first map is better than all before.
+        """Return what is found with one more start. A search from this start is made only if its first map is better than
+        all first maps before.
 
-        If not, and if it has the objects of the best map, it confirms this map. A search would lead to the same map."""
+        If its first map is not better, but has the objects of the best map, it confirms the best map. A search would lead to
+        the same map."""
         try:
             first = start()
             promising = self.first.gain(first) > 0
@@ -145,8 +152,8 @@ class _Found:
         return replace(self, left=(*self.left, first))
 
     def with_the_others(self) -> Self:
-        """Return what is found with the starts that are left, while the map is unclear and solves are left. Starts with
-        hopeless first maps are left out."""
+        """Return what is found after searches from the starts that are left. They end when the map is clear or no solves are
+        left. Starts with hopeless first maps (`_HOPELESS`) are left out."""
         found = self
         for first in sorted(self.left, key=lambda one: -one.explained):
             behind = found.state.explained - first.explained
@@ -156,8 +163,8 @@ class _Found:
         return found
 
     def searched(self, first: JointState) -> Self:
-        """Return what is found with a search from the first map of a start. It confirms the best map if both have the same
-        objects, whichever is better."""
+        """Return what is found after a search from the first map of a start. The best map is confirmed if the new map and
+        the former best map have the same objects."""
         try:
             state = _searched(first)
             best = self.state.better(state)
@@ -174,9 +181,10 @@ def _searched(state: JointState) -> JointState:
 
 
 def _from_tracks(begin: JointState) -> JointState:
-    """Return the state after a solve of the tracks of boxes as landmarks, and closures of the loops between them.
+    """Return the state after a solve with the tracks of boxes as landmarks, and after closures of the loops between them.
 
-    No gate of an exploration takes part, so this finds the drives of wheels that slip more than their odometry says."""
+    The gates of an exploration do not take part. So this start finds drives whose wheels slip more than the noise of the
+    odometry says."""
     found = associate_tracks(begin.keyframes, begin.rays)
     return with_missed_loops(begin.attempt().counted(found).solve("association", found))
 
@@ -184,12 +192,12 @@ def _from_tracks(begin: JointState) -> JointState:
 def _unclear(state: JointState, confirmed: bool = False) -> bool:
     """Return whether a map may be wrong, so that other starts are worth their time.
 
-    An exploration goes wrong by chance, so another start may be right. The false boxes of a detector agree with no object in
-    the best of maps, but they are single boxes. So only the rays of tracks are judged, if there are any. All rays may agree
-    with a map that shows the same things at several places. Copies of their relative positions then tell. All rays may also
-    agree because wrong objects made their noise large. But wrong maps of two starts differ. So some noise says nothing
-    against objects that another start found too (confirmed). A second exploration is no other start: it goes wrong as the
-    first one did.
+    An exploration goes wrong by chance, so another start may be right. The false boxes of a detector agree with no object
+    even in the best map, but they are single boxes. So only the rays of tracks are judged, if the log has tracks. All rays
+    may agree with a map that shows the same things at several places. Such a map has copies of the relative positions of
+    objects. All rays may also agree because wrong objects made the estimated noise large. But the wrong maps of two starts
+    differ. So some noise says nothing against objects that another start found too. confirmed: whether another start found
+    them. A second exploration does not count as another start, because it goes wrong as the first one did.
     """
     noise = 1.0 if state.errors is None else state.errors.noise.rays
     tracked = associate_tracks(state.keyframes, state.rays).object >= 0
@@ -198,22 +206,22 @@ def _unclear(state: JointState, confirmed: bool = False) -> bool:
 
 
 def _has_things_that_move(state: JointState) -> bool:
-    """Return whether many boxes of tracks have no object (`_AT_REST`)."""
+    """Return whether many boxes of tracks have no object (`_AT_REST`), because they show things that move."""
     assert state.association is not None
     tracked = associate_tracks(state.keyframes, state.rays).object >= 0
     return bool(tracked.any() and (state.association.object[tracked] < 0).mean() > 1 - _AT_REST)
 
 
 def from_start(state: JointState, start: InitialEstimate | None) -> JointState:
-    """Return the state after rounds from a start, or from the poses of the keyframes."""
+    """Return the state after rounds that begin at a start. Without a start, they begin at the poses of the keyframes."""
     map_T_camera = state.keyframes.map_T_camera if start is None else start.map_T_camera
     guess = None if start is None else (start.association, start.positions)
     return state.alternated(map_T_camera @ inverse(state.keyframes.base_T_camera), guess)
 
 
 def improved(state: JointState, step: Callable[[JointState], JointState]) -> JointState:
-    """Repeat a step until it no longer explains the rays better, and return the state. step: returns the state itself if it
-    finds nothing better."""
+    """Return the state after a step was repeated until the step no longer found a better state. step: a function that
+    returns its argument if it finds nothing better."""
     for _ in range(state.settings.joint.max_rounds):
         found = step(state)
         if found is state:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class RangeShift:
     """The corrections that make R ranges end at the centres of bodies instead of on their surfaces.
 
-    A range is corrected if a body shows how far the centre of its object is behind the surface (`range_shift`).
+    A range is corrected if a body shows how far the centre of its object lies behind the surface (`range_shift`).
 
     factor: (R,) the factor on the range. bias: (R,) the factor on `Rays.range_bias`. Both are 1 for a range that is not
     corrected. surface: (R, 2) the new `Rays.surface`, NaN for a range that is not corrected.
@@ -40,11 +40,11 @@ class RangeShift:
 
     @property
     def told(self) -> Bools:
-        """(R,) whether a body shows how far the centre is behind the surface."""
+        """A mask (R,) of the ranges for which a body shows how far the centre lies behind the surface."""
         return np.isfinite(self.surface[:, 0])
 
     def only(self, rays: Bools) -> RangeShift:
-        """Return the corrections of some ranges (R,). The others do not change."""
+        """Return the same corrections for the ranges in a mask (R,), and none for the others."""
         factor, bias = np.where(rays, self.factor, 1.0), np.where(rays, self.bias, 1.0)
         return RangeShift(factor, bias, np.where(rays[:, None], self.surface, np.nan))
 
@@ -65,9 +65,9 @@ class RangeShift:
 class CentreShift:
     """The corrections that turn R rays to the centres of bodies.
 
-    direction: (R, 3), added to the direction of each ray, in the camera frame. sigma: (R,) rad, the noise that this adds. It
-    is 0 unless something hides a part of the object in the image. ranges: the corrections of the ranges to these centres,
-    None if there are none.
+    direction: (R, 3), the vector to add to the unit direction of each ray, in the camera frame. sigma: (R,) rad, the noise
+    that the correction adds. It is 0 unless something hides a part of the object in the image. ranges: the corrections of
+    the ranges to the same centres, None if no range is corrected.
     """
 
     direction: Floats
@@ -75,12 +75,12 @@ class CentreShift:
     ranges: RangeShift | None = None
 
     def only(self, rays: Bools) -> CentreShift:
-        """Return the corrections of some rays (R,). The others do not change."""
+        """Return the same corrections for the rays in a mask (R,), and none for the others."""
         ranges = None if self.ranges is None else self.ranges.only(rays)
         return CentreShift(np.where(rays[:, None], self.direction, 0.0), np.where(rays, self.sigma, 0.0), ranges)
 
     def apply(self, rays: Rays) -> Rays:
-        """Return the rays to the centres of bodies. Their ranges do not change."""
+        """Return the rays turned to the centres of bodies. Their ranges do not change."""
         direction = rays.direction + self.direction
         direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
         return replace(rays, direction=direction, sigma=np.hypot(rays.sigma, self.sigma))
@@ -90,16 +90,16 @@ class CentreShift:
 class Solution:
     """The solved association and estimate, with the keyframes and rays that were solved.
 
-    keyframes: all with at least one ray. rays: with indices into these keyframes. rounds: counts of each round of
-    association and solve. trace: the rounds in detail, empty without a recording. bodies: the body of each object, None for
-    a point. to_centre: turns each ray to the centre of its body. hidden: (R,) whether something may hide a part of the
-    object in the box of each ray. bodies, to_centre and hidden are None if no bodies were solved. doubted: the
-    labels that may name one object or several. unsettled: the objects that the last round changed, as in `objects_changed`,
-    although no further round was allowed. unfinished: whether the search for a clear map took all its solves
-    (`joint.max_solves`). copied: the objects in the largest part of the map that shows the same things as another part.
-    errors: the estimated errors, as a function of the measurements. None if none were estimated. If a held error is gross,
-    it is among them too. whole: in fixed mode, the association before things that move along the view were dropped. A joint
-    solve does better with it, because it finds such things again at its own poses.
+    keyframes: all keyframes with at least one ray. rays: the rays, with indices into these keyframes. rounds: the counts of
+    each round of association and solve. trace: the rounds in detail, empty without a recording. bodies: the body of each
+    object, None for a point. to_centre: the correction that turns each ray to the centre of its body. hidden: (R,) whether
+    something may hide a part of the object in the box of each ray. bodies, to_centre and hidden are None if no bodies were
+    solved. doubted: the labels that may name one object or several. unsettled: the number of objects that the last round
+    changed (`objects_changed`), if no further round was allowed. unfinished: whether the search for a clear map took all its
+    solves (`joint.max_solves`). copied: the number of objects in the largest part of the map that shows the same things as
+    another part. errors: the shared errors that were estimated, None if none were. They include held errors that were found
+    to be gross. whole: in fixed mode, the association before things that move along the view were dropped. A joint solve
+    begins better with it, because the joint solve finds such things again at its own poses.
     """
 
     keyframes: Keyframes
@@ -120,10 +120,10 @@ class Solution:
 
 
 def as_centres(solution: Solution) -> Solution:
-    """Return a solution with bodies at given poses as if its boxes had been around their centres. The covariances do not
-    change.
+    """Return a solution at given poses with its rays turned to the centres of bodies, and its objects at these centres. The
+    covariances do not change.
 
-    Objects whose position is the point where rays meet keep their rays."""
+    An object whose body gives no centre keeps its rays and its position."""
     bodies = solution.bodies or ()
     centres = {j: body.centre for j, body in enumerate(bodies) if body is not None and body.centre is not None}
     if solution.to_centre is None or not centres:
@@ -152,8 +152,8 @@ def with_noise_of(errors: SharedErrors, estimate: Estimate) -> SharedErrors:
 
 
 def with_jumps(solution: Solution, jumps: Jumps) -> Solution:
-    """Return the solution with the error that is left in a map after `jumps` were removed from its poses. All objects share
-    this error."""
+    """Return the solution with larger covariances, for the error that is left after `jumps` were removed from the poses. All
+    objects share this error."""
     estimate, association, rays = solution.estimate, solution.association, solution.rays
     used = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))
     keyframe = rays.keyframe[used]
@@ -173,16 +173,19 @@ def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
 
 
 def rays_moved(before: Ints, after: Ints) -> int:
-    """Return how many rays (R,) changed their object. Renumbered objects count as the same. -1 means no object."""
+    """Return how many rays changed their object. before, after: (R,) the object of each ray, -1 for none. Renumbered objects
+    count as the same."""
     stayed = _same_objects(before, after)[2].sum() + ((before < 0) & (after < 0)).sum()
     return len(before) - int(stayed)
 
 
 def objects_changed(before: tuple[Association, Estimate], after: tuple[Association, Estimate]) -> int:
-    """Return how many objects are new, are gone, or moved by more than their sigma, between two solved associations.
+    """Return how many objects changed between two solved associations: they are new, are gone, or moved by more than their
+    sigma.
 
-    A sigma takes the association for granted. Rays that change their objects can move an object by more than its sigma. Then
-    its place is less certain than its sigma says. A few rays that go back and forth between neighbours hardly move anything.
+    A sigma holds only if the association is right. Rays that change their objects can move an object by more than its sigma.
+    Then the place of the object is less certain than the sigma says. A few rays that go back and forth between neighbours
+    hardly move an object.
     """
     (first, was), (second, now) = before, after
     i, j, _ = _same_objects(first.object, second.object)
@@ -193,7 +196,8 @@ def objects_changed(before: tuple[Association, Estimate], after: tuple[Associati
 
 
 def _same_objects(before: Ints, after: Ints) -> tuple[Ints, Ints, Ints]:
-    """Return the indices (n,) of objects before and after that are the same, and the rays (n,) that they share.
+    """Return the indices (n,) before and (n,) after of the objects that are the same, and the number (n,) of rays that they
+    share.
 
     before, after: (R,) the object of each ray, -1 for none.
     """

@@ -1,8 +1,7 @@
 """Find the frames in which a standing robot shows the same view again.
 
-All rays from one place meet, whatever the camera's pose on the robot is. A robot that stands for minutes would so hide a
-wrong mount, and its false boxes would outnumber the boxes from which points can be computed.
-"""
+All rays from one place meet, also with a wrong pose of the camera on the robot. So the frames of a robot that stands for
+minutes would hide this wrong pose. Their false boxes would also outnumber the boxes from which points can be computed."""
 
 import numpy as np
 
@@ -12,19 +11,19 @@ from objslam.core.geometry import interpolate
 from objslam.core.types import Log
 
 _STEP, _TURN = 0.05, np.radians(2.0)
-"""A robot stands while it is within this distance (m) and angle (rad) of the pose at which it came to rest. Localisations of
-robots at rest jitter by a few centimetres. Larger values take slow motions for rest."""
+"""The largest distance (m) and angle (rad) of a standing robot from the pose at which it came to rest. Localisations of
+robots at rest jitter by a few centimetres. With larger values, slow motions count as rest."""
 _SECONDS = 2.0
-"""A robot stands if it stays for longer than this (s). By `_STEP`, a robot of 0.025 m/s or more never stands. A larger
-value finds fewer standstills."""
+"""The shortest duration (s) of a standstill. A robot that drives at 0.025 m/s or more leaves `_STEP` within this time, so it
+never stands. A larger value finds fewer standstills."""
 
 
 def repeated_views(log: Log, stamps: Floats, settings: Settings) -> Bools:
-    """Return which frames (F,) show what an earlier frame of the same standstill shows.
+    """Return a mask (F,) of the frames that show what an earlier frame of the same standstill shows.
 
-    The robot stands if each path of the log says so: a localisation and an odometry. A frame outside of these paths, or in a
-    gap, is not repeated. stamps: (F,) s, the times of the frames of one camera, increasing. The camera does not move on the
-    robot.
+    The robot stands if each path of the log says so. The paths are the localisation and the odometry. A frame outside of
+    these paths, or in a gap, is not repeated. stamps: (F,) s, the increasing times of the frames of one camera. The camera
+    must not move on the robot.
     """
     motion, known = [], np.ones(len(stamps), dtype=bool)
     for path in (log.localization, log.odometry):
@@ -35,7 +34,7 @@ def repeated_views(log: Log, stamps: Floats, settings: Settings) -> Bools:
             turned = poses[:, :3, :3].reshape(-1, 9) / (np.sqrt(8) * np.sin(_TURN / 2))
             motion.append(np.concatenate([poses[:, :3, 3] / _STEP, turned], axis=1))
     repeated = np.zeros(len(stamps), dtype=bool)
-    begin = 0  # Each standstill begins where the one before ends, so the frames follow in a loop. They are a few hundred.
+    begin = 0  # Each standstill begins where the one before ends, so this is a loop over frames, which are a few hundred.
     while begin < len(stamps) and motion:
         end = begin + 1
         at = [path[begin] for path in motion]
@@ -48,6 +47,6 @@ def repeated_views(log: Log, stamps: Floats, settings: Settings) -> Bools:
 
 
 def _is_at(motion: list[Floats], at: list[Floats], frame: int) -> bool:
-    """Return whether a frame has the place and the heading `at` in each path."""
+    """Return whether a frame has the pose `at` in each path, within `_STEP` and `_TURN`."""
     apart = [path[frame] - pose for path, pose in zip(motion, at, strict=True)]
     return all(one[:3] @ one[:3] <= 1 and one[3:] @ one[3:] <= 1 for one in apart)

@@ -1,4 +1,4 @@
-"""The residuals of the rays if the shared errors, for example clock offsets, are not corrected."""
+"""Compute the residuals that the rays have without the correction of shared errors, for example clock offsets."""
 
 import numpy as np
 
@@ -10,10 +10,12 @@ from objslam.mapping.solution import Solution
 
 
 def uncorrected_residual(errors: SharedErrors, solution: Solution, path: Trajectory) -> Floats | None:
-    """Return the angles (R,), rad, between the rays as measured and their objects, NaN without an object.
+    """Return the angles (R,) in rad between the rays as measured and their objects. An angle is NaN for a ray without an
+    object. The result is None if no shared errors were estimated.
 
-    A ray as measured has the shared errors at the mean of their prior. The objects and the solved path are the same, so the
-    angles show what the correction improved. path: map_T_base at its full rate. None if no shared errors were estimated.
+    A ray as measured has the shared errors at the mean of their prior. The objects and the solved path are the same as with
+    the correction. So the angles show what the correction improved. path: the solved poses map_T_base, at the full rate of
+    the path.
     """
     if solution.estimate.calibration is None:
         return None

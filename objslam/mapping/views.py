@@ -1,4 +1,4 @@
-"""What the cameras of a drive had in view: all their frames, at the solved poses."""
+"""Compute what the cameras of a drive had in view: all camera frames, at the solved poses."""
 
 from dataclasses import replace
 
@@ -13,8 +13,9 @@ from objslam.frontend.keyframes import build_keyframes
 
 
 def solved_views(log: Log, settings: Settings, path: Trajectory) -> Keyframes:
-    """Return all camera frames of a log, at the poses of the solved path. log: without its shared errors."""
-    if log.localization is None:  # The path is the odometry in either mode, and views need no drift.
+    """Return all camera frames of a log, at the poses of the solved path. path: the solved path. log: without its shared
+    errors."""
+    if log.localization is None:  # The path is the odometry in both modes, and views need no drift.
         settings = settings.model_copy(update={"mode": "fixed"})
     frames = build_keyframes(log, settings, Ledger())
     at = np.clip(frames.stamps, path.stamps[0], path.stamps[-1])

@@ -1,4 +1,4 @@
-"""Find the shared errors of a log before any map: each track of boxes is a landmark of its own."""
+"""Find the shared errors of a log before there is a map. Each track of boxes serves as a landmark."""
 
 from __future__ import annotations
 
@@ -17,29 +17,31 @@ if TYPE_CHECKING:
     from objslam.mapping.joint.joint_alternation import JointState
 
 _ROUNDS = 2
-"""The number of times that tracks are found and solved. In the second round, the odometry expects each box at the place that
-the first round corrected. More rounds change the errors by less than their sigmas."""
+"""The number of rounds in which tracks are found and solved. The second round finds tracks with the odometry that the first
+round corrected. More rounds change the errors by less than their sigmas."""
 _APART = 0.15
-"""In each span of this time (s), one image of each camera is solved. A track needs no more images to be linked, and more of
-them would add little. A larger time makes the solve of a video faster, and loses tracks while the robot turns fast."""
+"""The length (s) of the spans of time from which one image of each camera is solved. These images are enough to link a
+track, and more images would add little. With a larger time, the solve of a video is faster, but tracks are lost while the
+robot turns fast."""
 _MOST = 3000
-"""About the largest number of rays that are solved. More rays would give the errors more exactly than an exploration needs,
-and would take longer."""
+"""About the largest number of rays that are solved. With a larger number, the errors are more exact than an exploration
+needs, and the solve takes longer."""
 _BLOCK = 50
-"""If more rays are left, this number of consecutive keyframes is solved at a time, and the next ones are left out. A track
-ends where its block ends. With a larger number, fewer tracks are cut, and fewer parts of the drive count."""
+"""The number of consecutive keyframes in a block. If there are more than `_MOST` rays, blocks at even intervals are solved,
+and the others are left out. A track ends where its block ends. With a larger number, fewer tracks are cut, but fewer parts
+of the drive count."""
 
 
 def with_errors_of_tracks(state: JointState) -> tuple[JointState, Floats]:
     """Return the state that begins at the shared errors which the tracks of boxes show.
 
-    Also return the poses (K, 4, 4) map_T_base on the path that the tracks correct. Wheels that slip turn the robot within a
-    track, so the track shows it.
+    Also return the poses (K, 4, 4) map_T_base of the path that the tracks correct. If wheels slip, the robot turns within a
+    track, so the track shows the slip.
 
     A track is a chain of boxes in images that follow each other (`frontend.tracks`). Nobody needs to know which tracks show
-    the same thing: at the right clocks, turns and rotations of cameras, the rays of each track meet in one point. So the
-    tracks are solved as landmarks, with the odometry and the priors of all errors. With ranges, the noise of the settings
-    stays. Short tracks leave the noise of distances open: in simulated videos, it was found twenty times too large.
+    the same thing. At the right clocks, turns and rotations of cameras, the rays of each track meet in one point. So the
+    tracks are solved as landmarks, with the odometry and the priors of all errors. If the log has ranges, the noise is not
+    estimated. Short tracks hardly show the noise of distances. In simulated videos, the estimate was twenty times too large.
 
     The first association of a drive takes these errors as given. With a gyroscope that turns by 0.2 degrees a second too
     much, the rays of one minute meet nowhere.
@@ -64,15 +66,16 @@ def with_errors_of_tracks(state: JointState) -> tuple[JointState, Floats]:
 
 
 def along(state: JointState, path: Floats) -> JointState:
-    """Return the state whose odometry is a path (K, 4, 4), for an exploration only: a solve would count the tracks twice."""
+    """Return the state whose odometry is a path (K, 4, 4). It is for an exploration only, because a solve would count the
+    tracks twice."""
     assert state.keyframes.odom_T_base is not None
     odom_T_base = state.keyframes.odom_T_base[0] @ inverse(path[0]) @ path
     return replace(state, keyframes=replace(state.keyframes, map_T_base=path, odom_T_base=odom_T_base))
 
 
 def _excerpt(state: JointState) -> JointState:
-    """Return an attempt with images that are some time apart. If they have more than `_MOST` rays, only some blocks of
-    consecutive keyframes stay. With ranges, the noise of the attempt is held."""
+    """Return an attempt with images that are about `_APART` apart. If these have more than `_MOST` rays, only some blocks of
+    consecutive keyframes stay. If there are ranges, the attempt does not estimate the noise."""
     assert state.errors is not None
     keep = _apart(state.keyframes.stamps, state.keyframes.camera)
     every = -(-int(keep[state.rays.keyframe].sum()) // _MOST)

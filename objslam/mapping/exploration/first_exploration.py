@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 def explored(state: JointState, filtered: bool = True) -> tuple[InitialEstimate, bool]:
     """Explore a log without a localisation. Return a first association, and whether the filter for logs with ranges is sure
-    of it. A filter that lost its way maps the same things at several places. filtered: whether to try this filter."""
+    of it. The filter is not sure if its map shows the same things at several places. filtered: whether to try this
+    filter."""
     from objslam.graph import ekf_exploration
     from objslam.graph.init_unknown_correspondences import initialize_unknown
 
@@ -33,8 +34,8 @@ def explored(state: JointState, filtered: bool = True) -> tuple[InitialEstimate,
 
 
 def solved_if_sure(state: JointState, start: InitialEstimate, sure: bool) -> tuple[JointState, InitialEstimate]:
-    """Return the state and the start of its rounds. If the filter was sure of the start, the state is solved with its
-    association, and holds the shared errors."""
+    """Return the state and the start of its rounds. If the filter was sure of the start, the association of the start is
+    solved. The returned start then has the solved poses, and the state holds the shared errors."""
     if not sure:
         return state, start
     solved = state.solve("association", start.association)

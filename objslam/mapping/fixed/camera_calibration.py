@@ -1,4 +1,4 @@
-"""Calibrate the cameras at known poses, in turns with the search for objects."""
+"""Calibrate the cameras at known poses. The calibration alternates with the search for objects."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ if TYPE_CHECKING:
     from objslam.graph.calibration.fixed_pose_calibration import FixedCalibration
 
 _NARROWER = (0.3, 0.0)
-"""If a log fits poorly, narrower first associations are tried, one for each of these shares. It allows for this share of the
-uncertainty of the shared errors. More shares take longer: each takes the time of one association."""
+"""The shares of the uncertainty of the shared errors for which narrower first associations allow. They are tried if a log
+fits poorly. Each share takes the time of one association."""
 _FITS = 2.0
-"""If the mean squared miss of a ray, in variances of its noise, is at most this, the widest association is taken, and no
-other is tried. Rays with the noise of the settings have 2, because they have two axes. With a larger value, fewer logs take
-the time for others, and rows of equal things are confused more often."""
+"""The largest mean squared miss of a ray, in variances of its noise, at which the widest association is taken without a
+trial of others. Rays with the noise of the settings have 2, because they have two axes. With a larger value, fewer logs take
+the time for other associations, but rows of equal things are confused more often."""
 _CLEARLY = 1.75
-"""A narrower association is taken if it lowers the mean over all rays of -2 ln of their probability by at least this. In
-simulated orchards and shelves, the right association lowers it by 2.1 to 6.1. If the poses are noisy, one thing may look
-like several. Then a wrong association lowers it by up to 1.4 (poses that err for seconds). With a smaller value, noisy poses
-split more things."""
+"""The least amount by which a narrower association must lower the misfit to be taken. The misfit is the mean over all rays
+of -2 ln of their probability. In simulated orchards and shelves, the right association lowers the misfit by 2.1 to 6.1. If
+the poses err for seconds, one thing may look like several. A wrong association then lowers the misfit by up to 1.4. With a
+smaller value, noisy poses split more things."""
 
 
 def calibrate_fixed(
@@ -46,15 +46,16 @@ def calibrate_fixed(
     progress: Progress,
     trace: Trace | None,
 ) -> tuple[FixedPoses, Association, Estimate, tuple[dict[str, int], ...]]:
-    """Estimate the shared errors of cameras at known poses, in turns with the association and the objects.
+    """Estimate the shared errors of cameras at known poses. The estimate alternates with the association and the solve of
+    objects.
 
-    The association allows for the present uncertainty of the errors: first their prior, then the covariance of the last fit.
-    In rows of equal things, it allows only for the part of the uncertainty that moves rays off their objects. If the errors
-    still change after two associations (in rows of equal things, after one), the next ones begin with the objects that there
-    are, because searches among all rays take long, and each finds a few other objects. After these have settled, there is
-    one more search. The covariance of the errors is added to the covariance of the objects. Returns the input without the
-    errors, the association, the estimate, and the number of objects in each round. If the errors cannot be estimated, they
-    stay as they were, and the ledger gets a warning.
+    Each association allows for the present uncertainty of the errors. This is first their prior, and then the covariance of
+    the last fit. In rows of equal things, it is only the part of the uncertainty that moves rays off their objects. The
+    errors may still change after two associations, or after one in rows of equal things. Then the next associations begin
+    with the known objects, because a search among all rays takes long, and each search finds a few other objects. When the
+    errors no longer change, there is one more search among all rays. The covariance of the errors is added to the covariance
+    of the objects. Return the input without the errors, the association, the estimate, and the number of objects in each
+    round. If the errors cannot be estimated, they stay as they were, and the ledger gets a warning.
     """
     from objslam.graph.calibration.fixed_pose_calibration import (
         calibrate_at_poses,
@@ -90,7 +91,7 @@ def calibrate_fixed(
             return now, association, replace(estimate, calibration=calibration, uncalibrated=True), rounds
         earlier.append((calibration.values, np.hypot(_own(now), told)))
         calibration, now = found.calibration, trial.corrected
-        # Wide gates also hold the rays of poses whose errors last. In rows of equal things they hold those of neighbours.
+        # Wide gates also keep the rays of poses whose errors last. In rows of equal things, they keep rays of neighbours.
         told = (
             noise_beside_objects(errors, found, association, trial.moved) if in_rows else noise_of_errors(every, calibration)
         )
@@ -130,10 +131,10 @@ def calibrate_fixed(
 def _calibrated_by_centres(
     now: FixedPoses, errors: SharedErrors, association: Association, estimate: Estimate, theta: Floats
 ) -> FixedCalibration | None:
-    """Return the calibration by bearings to the centres of bodies, None if no body shifts its bearings enough.
+    """Return the calibration by bearings to the centres of bodies. Return None if no body shifts its bearings enough.
 
-    The centre of the box of a large thing nearby lies beside the image of the thing's centre, in the same direction from all
-    sides. So the centres of boxes would tilt the camera, or move the centre of its image. now: the input at the errors theta
+    The box of a large thing nearby has its centre beside the image of the thing's centre. It lies in the same direction in
+    all images. So the centres of boxes would tilt the camera, or move its image centre. now: the input at the errors theta
     (P,), with its estimate.
     """
     from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses
@@ -149,14 +150,15 @@ def _calibrated_by_centres(
     noise = largest_noise(now.seen, now.settings)
     try:
         return calibrate_at_poses(turned, association, placed_objects(estimate), theta, noise)
-    except SolveError:  # The calibration by the centres of boxes holds.
+    except SolveError:  # The calibration by the centres of boxes stays.
         return None
 
 
 def associate_at_poses(at: FixedPoses, log: Log, progress: Progress) -> Association | None:
-    """Return the association of the fixed mode, at known poses and calibrated cameras. None if nothing is to be calibrated.
+    """Return the association of the fixed mode, at known poses and calibrated cameras. Return None if no error is to be
+    calibrated.
 
-    at: as measured. Its mode does not matter.
+    at: the input as measured. Its mode does not matter.
     """
     at = replace(at, settings=at.settings.model_copy(update={"mode": "fixed"}))
     errors = shared_errors(log, at.seen, at.rays_seen, at.settings)
@@ -165,11 +167,12 @@ def associate_at_poses(at: FixedPoses, log: Log, progress: Progress) -> Associat
 
 @dataclass(frozen=True)
 class _Trial:
-    """An association at some values of the errors, and what follows from it.
+    """An association at some values of the shared errors, and the calibration by it.
 
-    estimate: the objects at these values. found: the calibration by these objects, None if `failure` prevents it. moved:
-    (N, 3) m, the objects at the calibrated errors, NaN without a position. corrected: the input at the calibrated errors,
-    with the noise of the poses that it shows. trace: the record of the estimate, None if nothing is recorded.
+    estimate: the objects at these values. found: the calibration by these objects, None if it failed. failure: why it
+    failed, else None. moved: (N, 3) m, the positions of the objects at the calibrated errors, NaN without a position.
+    corrected: the input at the calibrated errors, with the noise of the poses that the rays show. trace: the record of the
+    estimate, None if nothing is recorded.
     """
 
     association: Association
@@ -181,7 +184,7 @@ class _Trial:
     trace: Trace | None
 
     def left(self) -> tuple[float, float]:
-        """Return the misfit that the calibration leaves (`_left`). It is infinite without a calibration."""
+        """Return the two values of `_left` after the calibration. They are infinite without a calibration."""
         if self.found is None:
             return float("inf"), float("inf")
         return _left(self.corrected, self.association, self.moved)
@@ -223,14 +226,15 @@ def _first_trial(
     told: Floats,
     trace: Trace | None,
 ) -> tuple[_Trial, bool]:
-    """Return the association at the expected errors that a calibration brings closest to the noise of the settings.
+    """Return the trial of the best association at the expected errors. Its rays come closest to the noise of the settings
+    after a calibration. Also return whether it is a narrower association.
 
     The widest association allows for all the uncertainty that the errors give to the directions of rays. It is right if
-    things are far apart. In a row of equal things, it is wider than the gaps, and rays of neighbours become one object at a
-    wrong distance. Then a narrower association is right. After a calibration, the rays of a right association fit, and the
-    rays of wrong objects still miss. So the associations are compared by how likely the rays are after a calibration. A
-    narrower one has to be clearly better than the widest. The widest one that has an object is taken at once if it fits.
-    Also return whether a narrower one is taken.
+    things are far apart. In a row of equal things, its gates are wider than the gaps, and rays of neighbours become one
+    object at a wrong distance. Then a narrower association is right. After a calibration, the rays of a right association
+    fit, and the rays of wrong objects still miss. So the associations are compared by how likely the rays are after a
+    calibration. A narrower association has to be clearly better than the widest. The widest association that has an object
+    is taken at once if it fits.
 
     at, now: the input as measured, and at the expected errors. told: (R,) rad, the noise of rays because of the uncertainty
     of the errors.
@@ -241,7 +245,7 @@ def _first_trial(
     tried: list[Ints] = []
     for share in (1.0, *_NARROWER):
         association = wide if share == 1.0 else now.associate(share * told)
-        # Without an object, nothing is calibrated. The rays of an earlier association leave the same again.
+        # Without an object, nothing is calibrated. An association that was tried already would leave the same misfit.
         if not association.count or any(np.array_equal(association.object, earlier) for earlier in tried):
             continue
         tried.append(association.object)
@@ -256,11 +260,13 @@ def _first_trial(
 
 
 def _left(at: FixedPoses, association: Association, positions: Floats) -> tuple[float, float]:
-    """Return two means over the rays: the squared miss, in variances, and -2 ln of the probability, up to a constant.
+    """Return two means over the rays: the squared miss in variances of the noise, and -2 ln of the probability up to a
+    constant.
 
-    Noise above the settings adds 4 ln of its factor to the miss, as in the normal distribution. If there are more objects of
-    a label, its rays can belong to more of them, and each is less likely. An object costs as in the Bayesian information
-    criterion (Schwarz 1978). at: with the noise of the poses. positions: (N, 3) m, NaN for an object without a position.
+    Noise above the settings adds 4 ln of its factor to the miss, as in the normal distribution. If a label has more objects,
+    a ray has more objects to choose from, so each choice is less likely. An object costs as in the Bayesian information
+    criterion (Schwarz 1978). at: the input, with the noise of the poses. positions: (N, 3) m, NaN for an object without a
+    position.
     """
     from objslam.graph.fixed_pose_triangulation import pose_noise
 

@@ -1,10 +1,9 @@
-"""The far side of objects that were seen with little parallax.
+"""Widen the covariances of objects that were seen with little parallax, so that they reach to the far side.
 
-Rays from one stretch of the path measure the inverse of a depth (Civera, Davison and Montiel 2008). So an error of a ray to
-one side moves an object far away, and the same error to the other side moves it only a little nearer. Wrong positions are
-mostly too near, and near positions get a small covariance from the same noise of rays. The true position would then be far
-outside the ellipsoid.
-"""
+Rays from one stretch of the path measure the inverse of a depth (Civera, Davison and Montiel 2008). If a ray errs to one
+side, the object moves far away. If it errs as much to the other side, the object moves only a little nearer. Wrong positions
+are mostly too near. At a near position, the same noise of rays gives a small covariance. The true position would then be far
+outside the ellipsoid."""
 
 from dataclasses import replace
 
@@ -14,21 +13,21 @@ from objslam.core.arrays import Floats
 from objslam.mapping.solution import Solution
 
 _SIGMAS = 2.0
-"""The distance of the far end from the mean, in standard deviations of the inverse depth. 2 is the reach of 95 % of a normal
-distribution along one axis. A larger number widens more."""
+"""The number of standard deviations of the inverse depth from the mean to the far end. Within 2 standard deviations lie 95 %
+of a normal distribution. With a larger number, covariances become wider."""
 _MOST = 0.4
-"""The largest standard deviation, as a share of the depth, at which the far end counts. From 0.5 on, the far end is at
-infinity. With a larger share, objects whose place the rays hardly determine become wider."""
+"""The limit of the standard deviation, as a share of the depth, in the computation of the far end. From 0.5 on, the far end
+would be at infinity. With a larger limit, objects whose place the rays hardly determine become wider."""
 
 
 def with_far_sides(solution: Solution) -> Solution:
     """Return the solution with covariances that reach to the far end of the depths that the rays allow.
 
     An object at the depth d has the standard deviation s along its mean ray. So its inverse depth 1 / d has the standard
-    deviation s / d^2. At the far end of the depths, the inverse depth is smaller by `_SIGMAS` times that. This is the depth
-    d / (1 - `_SIGMAS` s / d). For an ellipsoid that reaches there, s becomes s / (1 - `_SIGMAS` s / d).
-    Objects with a measured range keep their covariance, because a range errs as much to both sides. Objects that were seen
-    from many sides nearly keep it too, because their s is a small share of d.
+    deviation s / d^2. At the far end, the inverse depth is smaller by `_SIGMAS` times s / d^2, so the depth is d / (1 -
+    `_SIGMAS` s / d). For an ellipsoid that reaches to the far end, s becomes s / (1 - `_SIGMAS` s / d). Objects with a
+    measured range keep their covariance, because a range errs as much to both sides. The covariance of objects that were
+    seen from many sides hardly changes, because their s is a small share of d.
     """
     rays, estimate = solution.rays, solution.estimate
     index, covariance = solution.association.object, estimate.covariance
@@ -52,7 +51,7 @@ def with_far_sides(solution: Solution) -> Solution:
 def far_sigma(sigma: Floats, depth: Floats) -> Floats:
     """Return the standard deviations (N,), m, of ellipsoids that reach to the far end of their depths.
 
-    sigma: (N,) m, their standard deviations before. depth: (N,) m.
+    sigma: (N,) m, the standard deviations before, along the mean ray. depth: (N,) m, the depths of the objects.
     """
     share = np.minimum(sigma / np.maximum(depth, 1e-9), _MOST)
     return np.asarray(sigma / (1 - _SIGMAS * share))

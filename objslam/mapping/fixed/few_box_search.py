@@ -20,22 +20,24 @@ if TYPE_CHECKING:
     from objslam.association.few_rays.additional_objects import FewRayEvidence
 
 _MOST_BOXES = 600
-"""The most boxes that are searched, from frames that follow each other. More boxes are more exact and take longer."""
+"""The most boxes that are searched, from frames that follow each other. With a larger number, the noise is more exact, and
+the search takes longer."""
 _EXPLAINED = 0.5
-"""The least share of the boxes that the objects must explain. With a smaller share, noise is taken for objects."""
+"""The least share of the boxes that the found objects must explain. With a smaller share, stray boxes are taken for
+objects."""
 
 
 @dataclass(frozen=True)
 class SparseNoise:
-    """Factors on the noise in the settings: of `localization.xy`, of `depth.sigma` and `depth.sigma_per_m`, and of
-    `rays.pixel_sigma` and `rays.box_sigma`."""
+    """Three factors on the noise in the settings. place: on `localization.xy`. ranges: on `depth.sigma` and
+    `depth.sigma_per_m`. rays: on `rays.pixel_sigma` and `rays.box_sigma`."""
 
     place: float = 1.0
     ranges: float = 1.0
     rays: float = 1.0
 
     def settings(self, nominal: Settings) -> Settings:
-        """Return the settings with this noise."""
+        """Return settings with this noise. nominal: the settings to which the factors apply."""
         where, depth, rays = nominal.localization, nominal.depth, nominal.rays
         update = {
             "localization": where.model_copy(update={"xy": where.xy * self.place}),
@@ -61,9 +63,10 @@ class SparseNoise:
 class Searched:
     """The objects that a search finds under an assumed noise.
 
-    The arrays describe the P rays that have an object. Their frame has z up. direction: (P, 3) of each ray. shift: (P, 3) m,
-    from the given to the corrected origin of the ray. apart: (P, 3) m, from the corrected origin to the object. range: (P,)
-    m, NaN if unknown. sigma: (P,) rad, range_sigma: (P,) m, and place: m, the noise in the settings.
+    The arrays describe the P rays that have an object, in a frame with z up. direction: (P, 3) the unit vector of each ray.
+    shift: (P, 3) m, from the given to the corrected origin of the ray. apart: (P, 3) m, from the corrected origin to the
+    object. range: (P,) m, NaN if unknown. The last three are the noise in the settings. sigma: (P,) rad, of the directions.
+    range_sigma: (P,) m, of the ranges. place: m, of the places.
     """
 
     noise: SparseNoise
@@ -78,7 +81,7 @@ class Searched:
 
     @property
     def value(self) -> float:
-        """The evidence for the noise. It is minus infinity if the noise explains too few boxes."""
+        """The log evidence for the noise. It is minus infinity if the objects explain too few boxes."""
         return self.found.chance + self.found.detections if self.found.explained >= _EXPLAINED else -np.inf
 
     @property
@@ -117,7 +120,7 @@ def search_objects(log: Log, settings: Settings, noise: SparseNoise, *, correct_
 
 
 def middle(log: Log) -> Log:
-    """Return the log with only the frames in its middle. They have at most `_MOST_BOXES` boxes."""
+    """Return the log with only the frames in its middle, which have about `_MOST_BOXES` boxes at most."""
     found = [one.detections for one in log.cameras if one.detections is not None]
     stamps = np.sort(np.concatenate([one.frame_stamps[one.frame] for one in found]))
     if len(stamps) <= _MOST_BOXES:

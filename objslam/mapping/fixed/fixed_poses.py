@@ -25,25 +25,26 @@ if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
 
 MOST_ROUNDS = 12
-"""The most rounds of association and calibration. Two or three are usual. A clock that is off by a second moves by 0.03 s in
-a round, so it reaches its bound after ten rounds. A larger number is slower for logs that do not settle."""
+"""The most rounds of association and calibration. Two or three are usual. The estimate of a clock that is off by a second
+moves by 0.03 s in a round, so it reaches its bound after ten rounds. With a larger number, logs that do not settle take
+longer."""
 SAME = 0.05
-"""An association is repeated only if ray directions or their noise are new: they differ from each earlier round by more than
-this share of the noise. A smaller change moves hardly any ray across a gate, and a cycle of rounds repeats itself. A larger
-share ends sooner. A limit in standard deviations of the shared errors does not work: with precise errors, the association
-can swing between two states for ever."""
+"""The largest difference from an earlier round, as a share of the noise, at which the rounds end. It is the difference of
+ray directions and of their noise. A smaller change moves hardly any ray across a gate, and a return to an earlier round
+would repeat itself. With a larger share, the rounds end sooner. A limit in standard deviations of the shared errors does not
+work. If these are precise, the association can alternate between two states for ever."""
 _FIRST = 0.05
-"""The noise (rad) of ray directions that is added to the noise in the settings, for the association from which the noise of
-the poses is taken. The priors of the shared errors of a camera allow errors of about this size. With a larger value, near
-objects become one, and then their rays show nothing of the poses."""
+"""The noise (rad) of ray directions that a first association adds to the noise in the settings. The noise of the poses is
+then estimated from this association. The priors of the shared errors of a camera allow errors of about this size. With a
+larger value, neighbouring objects become one, and their rays no longer show the noise of the poses."""
 
 
 @dataclass(frozen=True)
 class FixedPoses:
     """The input of an association at given poses.
 
-    frames, rays: all keyframes with a pose, also without rays. seen, rays_seen: the keyframes that have a ray, and the rays
-    with indices into them.
+    frames: all keyframes with a pose, with and without rays. rays: the rays, with indices into `frames`. seen: the keyframes
+    that have a ray. rays_seen: the rays, with indices into `seen`.
     """
 
     frames: Keyframes
@@ -73,17 +74,19 @@ class FixedPoses:
     def noise_of_poses(self, association: Association, positions: Floats, weight: Floats) -> tuple[float, float]:
         """Return the factors on `localization.yaw` and `localization.xy` that the rays show, 1 if they are not estimated.
 
-        positions: (N, 3) m, NaN for an object without a position. weight: (R,) 0 for a rejected ray. A rejected ray does not
-        count."""
+        positions: (N, 3) m, NaN for an object without a position. weight: (R,) the weight of each ray. Rays of weight 0 were
+        rejected, and do not count."""
         if not self.noise_unknown:
             return 1.0, 1.0
         agreeing = replace(association, object=np.where(weight > 0, association.object, -1))
         return noise_in_frames(self.seen, self.rays_seen, agreeing, positions, self.settings)
 
     def associate(self, more: Floats | float = 0.0, guess: tuple[Association, Floats] | None = None) -> Association:
-        """Associate the rays. more: (R,) rad, noise of the ray directions in addition to the noise of boxes and poses.
+        """Return an association of the rays. more: (R,) rad, noise of the ray directions in addition to the noise of boxes
+        and poses.
 
-        guess: an association at nearly these poses, and the positions (N, 3) m of its objects. The association begins there.
+        guess: an association at nearly these poses, and the positions (N, 3) m of its objects. The search begins at this
+        guess.
         """
         from objslam.association.global_association import associate_globally
 
@@ -101,7 +104,7 @@ class FixedPoses:
         more: Floats | float = 0.0,
     ) -> tuple[Association, Estimate]:
         """Return the association and the estimate with the objects that can be found from few rays, and without objects of
-        things that move. Both stay the same if nothing changes.
+        things that move. If the objects stay the same, both are returned as they are.
 
         more: as in `associate`. parameters: as in `solve`.
         """
@@ -118,9 +121,9 @@ class FixedPoses:
         return (association, estimate) if left is association else (left, self.solve(left, trace, parameters))
 
     def without_things_along_the_view(self, association: Association, estimate: Estimate) -> tuple[Association, Estimate]:
-        """Return the association and the estimate without objects of things that move along the view, as their ranges show.
+        """Return the association and the estimate without objects whose ranges show that their things move along the view.
 
-        Both stay the same if there are none. At given poses, the other objects stay where they are."""
+        If there is no such object, both are returned as they are. At given poses, the other objects keep their positions."""
         from objslam.mapping.moves.receding_things import things_along_the_view
 
         if self.settings.association.method == "by_label":
@@ -139,7 +142,8 @@ class FixedPoses:
         return PosedRays(self.rays, self.frames, self.cameras, self.frames.map_T_camera, *noise)
 
     def solve(self, association: Association, trace: Trace | None, parameters: Parameters | None = None) -> Estimate:
-        """Triangulate the objects of an association, and record a round. parameters: the shared errors that were removed."""
+        """Return the estimate of the objects of an association, and record it as a round in the trace. parameters: the
+        shared errors that were removed."""
         from objslam.graph import batch_solver
         from objslam.graph.fixed_pose_triangulation import triangulate_at
 
@@ -158,12 +162,12 @@ class FixedPoses:
 def associate_fixed(
     at: FixedPoses, progress: Progress, trace: Trace | None
 ) -> tuple[FixedPoses, Association, Estimate, tuple[dict[str, int], ...]]:
-    """Find the objects, and the noise of the poses if the settings allow it.
+    """Find the objects at given poses. If the settings allow it, also estimate the noise of the poses.
 
-    With too narrow gates, one object becomes several, and their rays show hardly any noise. So the noise is first taken from
-    an association with wide gates. Then the association and the noise are found in turns until the noise no longer changes.
-    Returns the input with this noise, the association, the estimate, and the number of objects in each round if there were
-    several.
+    With too narrow gates, one object becomes several, and the rays of each show hardly any noise. So the noise is first
+    taken from an association with wide gates. Then association and noise alternate until the noise no longer changes. Return
+    the input with this noise, the association, the estimate, and the number of objects in each round. The last is empty
+    after a single round.
     """
     rounds: tuple[dict[str, int], ...] = ()
     earlier: list[tuple[float, float]] = []
@@ -188,7 +192,7 @@ def associate_fixed(
 
 
 def placed_objects(estimate: Estimate) -> Floats:
-    """Return the positions (N, 3), m, NaN for an object without one."""
+    """Return the positions (N, 3), m, of the objects. The position is NaN for an object that was not solved."""
     return np.where(estimate.solved[:, None], estimate.positions, np.nan)
 
 
@@ -197,7 +201,7 @@ def _same_noise(one: tuple[float, float], other: tuple[float, float]) -> bool:
 
 
 def with_noise_of(estimate: Estimate, at: FixedPoses) -> Estimate:
-    """Return an estimate that names the noise of the poses, if the log shows more than the settings say."""
+    """Return the estimate with the noise of the poses, if the log shows more noise than the settings say."""
     heading, place = at.seen.pose_noise
     if heading == place == 1.0:
         return estimate

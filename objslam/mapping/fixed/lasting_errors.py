@@ -1,8 +1,8 @@
-"""Errors of given poses that last for some seconds. All rays of this time miss their objects on the same side.
+"""Add the errors of given poses that last for some seconds to the covariances of a map.
 
-Poses in a plane turn and shift rays to the left or to the right. Poses in 3D turn and shift them up or down as well. Many
-rays from one visit do not average such an error out, so they count as few. The rays of several visits show its size.
-"""
+During such an error, all rays miss their objects on the same side. Errors of poses in a plane turn and shift rays to the
+left or to the right. Errors of poses in 3D also turn and shift rays up or down. Many rays from one visit do not average such
+an error out, so they count as few rays. The rays of several visits show the size of the error."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,48 +26,49 @@ from objslam.mapping.moves.odometry_witness import odometry_contradicts
 from objslam.mapping.solution import Solution, as_centres
 
 _CELL = 1.0
-"""The length (s) of the shortest cell. The rays of an object in one cell count as one ray. A longer time is faster, and sees
-shorter errors as noise."""
+"""The length (s) of the shortest cell. The rays of an object in one cell count as one ray. With a longer cell, the estimate
+is faster, but more of the short errors count as noise."""
 _MOST_CELLS = 48
-"""The most cells of an object. If an object was seen for so long that it would have more cells, the length of its cells is
-doubled until they are few enough. A larger number gives shorter cells and is slower."""
+"""The most cells of an object. If an object would have more cells, the length of its cells is doubled until they are few
+enough. With a larger number, cells are shorter, and the estimate is slower."""
 _LARGE = 1.0
-"""A run at given poses warns of errors of the poses that last for seconds, if they are at least this multiple of the noise
-`localization`. At 1, the lasting errors alone are as large as all errors together should be. A larger value warns less
+"""The least size of errors of given poses that last for seconds, as a multiple of the noise `localization`, at which a run
+warns. At 1, the lasting errors alone are as large as all errors together should be. With a larger value, runs warn less
 often."""
 _LARGE_WITH_ODOMETRY = 0.75
-"""The multiple `_LARGE` if the odometry also says that the poses err for seconds. With two witnesses, each needs to show
-less: false objects take up a part of the errors, so the boxes show too small errors. A larger value warns less often."""
+"""The least size, as for `_LARGE`, if the odometry also says that the poses err for seconds. It is smaller, because false
+objects take up a part of the errors, so the boxes show too small errors. With a larger value, runs warn less often."""
 _FEWEST = 3
-"""A run warns of lasting errors only if at least this number of objects show them. All boxes of one object may lie beside
-the object in the same way for seconds, so one object says little about the poses. A larger number warns less often."""
+"""The fewest objects that must show lasting errors, so that a run warns. All boxes of one object may lie beside the object
+in the same way for seconds, so one object says little about the poses. With a larger number, runs warn less often."""
 _SMALL = 0.2
-"""If the errors are above this multiple of the noise `localization`, they are estimated again, with the boxes moved to the
-centres of bodies. A larger value takes less time, and blames the poses for boxes of large things."""
+"""The multiple of the noise `localization` above which lasting errors are estimated again, with the boxes moved to the
+centres of bodies. With a larger value, runs take less time, but errors of the boxes of large things count as errors of
+poses."""
 LASTING = "lasting localisation errors"
 """The name of the finding that given poses err for seconds."""
 _POOLED = 20.0
-"""With this many rays, the scatter inside cells weighs as much as the noise in the settings. A larger number trusts the
-settings more."""
+"""The number of rays with which the scatter inside cells weighs as much as the noise in the settings. With a larger number,
+the settings weigh more."""
 
 
 def with_lasting_errors(
     solution: Solution, settings: Settings, with_bodies: Callable[[Solution], Solution] | None = None
 ) -> tuple[Solution, LastingNoise | None]:
-    """Return the solution of a run at given poses with their lasting errors added to its covariances, and these errors. They
-    are None if the log does not show them, or if the poses are not planar.
+    """Return the solution of a run at given poses, with the lasting errors of the poses added to its covariances. Also
+    return these errors. They are None if the log does not show them, or if the poses are not planar.
 
-    A pose has an error of its heading and an error of its place. Both turn a ray to a side, as seen from the object. If the
-    poses are not in a plane, they have such errors along each axis, and also turn a ray up or down. On uneven ground, planar
-    poses also turn rays up or down. This has the size `planar` times another factor. Ground whose tilt lasts also rises or
-    falls (`rise_of`).
-    The size of the errors is `localization` times a factor, whose prior is half-normal with the scale 1. Their correlation
-    falls exponentially over time. The factor and the correlation time are estimated by restricted maximum likelihood
-    (Patterson and Thompson 1971), and averaged over their posterior.
+    A pose has an error of its heading and an error of its place. Both turn a ray to a side, as seen from the object. Poses
+    that are not in a plane have such errors along each axis, which also turn a ray up or down. On uneven ground, planar
+    poses also turn rays up or down. The size of this error is the noise `planar` times a factor of its own. Ground whose
+    tilt lasts also rises or falls (`rise_of`). The size of the other errors is the noise `localization` times a factor. The
+    prior of the factor is half-normal with the scale 1. The correlation of the errors falls exponentially over time. The
+    factor and the correlation time are averaged over their posterior, with a restricted likelihood (Patterson and Thompson
+    1971).
 
-    If a large thing is near, the centre of its box is not at the image of its centre, for as long as the robot drives by.
-    with_bodies: finds the bodies, so that the boxes can count as if they had been around the centres. If it was called, the
-    returned solution has the bodies.
+    While a robot drives past a large thing, the centre of the thing's box lies beside the image of the thing's centre.
+    with_bodies: a function that finds the bodies, so that the boxes can count as if they were around the centres. It is
+    called only for errors above `_SMALL`. The returned solution then has the bodies.
     """
     if not solution.keyframes.localized_every:
         return solution, None
@@ -105,7 +106,7 @@ def check_lasting_noise(noise: LastingNoise, settings: Settings, log: Log) -> Fi
     """Return a finding if errors of given poses last for seconds, and are larger than the settings say.
 
     All rays of these seconds miss their objects to the same side, so an object can become two. The covariances of the map
-    contain these errors. log: its odometry is a second witness.
+    contain these errors. log: the log whose odometry is a second witness.
     """
     said = settings.localization
     size = max(noise.yaw / max(said.yaw, 1e-12), noise.xy / max(said.xy, 1e-12))
@@ -124,8 +125,8 @@ def check_lasting_noise(noise: LastingNoise, settings: Settings, log: Log) -> Fi
 
 
 def _cells_of(solution: Solution, settings: Settings) -> list[Cells]:
-    """Return the cells of all objects with a covariance. Planar poses on uneven ground have a second entry, for misses up
-    and down. Rejected rays, and ranges, do not count."""
+    """Return the cells of all objects with a covariance. For planar poses on uneven ground, a second entry has the misses up
+    and down. Rejected rays and ranges do not count."""
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     placed = np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(estimate.positions[:, 0])
     which = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))
@@ -184,10 +185,11 @@ def _by_cell(
 ) -> Cells:
     """Return the cells of all objects, from misses along one axis.
 
-    times: (R,) s. owner: (R,) objects. miss: (R,) rad, and white: (R,) rad, its noise. axis: (R, 3) the unit vector, and
-    lever: (R,) m, the distance, at which the miss moves an object. errors: (R, 3) rad each, the miss by one standard
-    deviation of rotations and of places. strength: (R,) the weight of each ray in the solve. inverse: (N, 3, 3) of the
-    information about each object.
+    times: (R,) s, of the rays. owner: (R,) the object of each ray. miss: (R,) rad, the angle by which each ray misses its
+    object. white: (R,) rad, the noise of the miss. axis: (R, 3) the unit vector along which the miss is. lever: (R,) m, the
+    distance over which the miss moves the object. errors: two arrays (R, 3), rad, the miss by one standard deviation of
+    rotations and of places, about or along each axis. strength: (R,) the weight of each ray in the solve. inverse: (N, 3, 3)
+    the inverse of the information about each object.
     """
     first, cell = _cells(times, owner, len(inverse))
     weight = white**-2
@@ -218,7 +220,7 @@ def _joined(one: Cells, other: Cells) -> Cells:
 
 
 def _cells(times: Floats, owner: Ints, count: int) -> tuple[Ints, Ints]:
-    """Return the object of each cell, in order, and the cell of each ray (R,)."""
+    """Return the object (C,) of each cell, in the order of objects, and the cell (R,) of each ray."""
     width = np.full(count, _CELL)
     while True:
         number = np.floor((times - times.min()) / width[owner]).astype(np.int64)

@@ -1,9 +1,8 @@
-"""The size of errors of given poses that last for some seconds, from the rays of all objects together.
+"""Estimate the errors of given poses that last for some seconds, from the rays of all objects together.
 
-An object that was seen only for a few seconds hides the errors of these seconds: its place is fitted to them, so its own
-rays miss it by little. But the same errors turn the rays to every object of these seconds. Each object can absorb only what
-a shift of its own explains. So all objects together show the errors.
-"""
+An object that was seen only for a few seconds hides the errors that the poses have in this time. Its place is fitted to the
+errors, so its own rays miss it by little. But the same errors turn the rays to every object seen in these seconds. Each
+object can hide only what a shift of this object explains. So all objects together show the errors."""
 
 from dataclasses import dataclass
 
@@ -13,23 +12,24 @@ from objslam.core.arrays import Floats, Ints
 from objslam.errors import SolveError
 
 TIMES = (1.0, 4.0, 16.0, 64.0)
-"""The correlation times (s) of errors, after which the correlation is 1/e. The shortest fits a jump of a scan matcher, the
-longest an error of the map around a place. More times are finer and slower."""
-_FACTORS = np.append(0.0, np.geomspace(0.1, 20.0, 40))
-"""The tried standard deviations of lasting errors, as multiples of the noise of the poses. More factors are finer and
+"""The tried correlation times (s) of lasting errors. After this time, the correlation is 1/e. The shortest time fits a jump
+of a scan matcher, and the longest fits an error of the map around a place. With more times, the estimate is more exact and
 slower."""
+_FACTORS = np.append(0.0, np.geomspace(0.1, 20.0, 40))
+"""The tried standard deviations of lasting errors, as multiples of the noise of the poses. With more factors, the estimate
+is more exact and slower."""
 _KINDS = np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-"""The tried mixtures: only rotations err, rotations and places err by one factor, only places err. More mixtures are finer
-and slower."""
+"""The tried mixtures of errors, one a row: only rotations err, rotations and places err by one factor, or only places err.
+With more mixtures, the estimate is more exact and slower."""
 _LOOSE = 1.0
 """The prior standard deviation (m) of the error of a solved position. With a larger value, the rays decide more."""
 _MOST = 400
-"""The most cells that count. Some hundred cells determine the factor to a few percent. The time grows with the cube of this
-number."""
+"""The most cells that count. Some hundred cells determine the factor to a few percent. The time of the estimate grows with
+the cube of this number."""
 _TOGETHER = 50
-"""If there are more than `_MOST` cells, only stretches of this many cells count, in the order of time. Single cells would
-not do, because only cells of the same seconds share their errors. Longer stretches show errors that last longer, but fewer
-parts of the drive."""
+"""The number of cells in a stretch. If there are more than `_MOST` cells, only some stretches count. A stretch has cells
+that follow each other in time, because only cells of the same seconds share their errors. Longer stretches show errors that
+last longer, but cover fewer parts of the drive."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,12 @@ class Cells:
     """The misses of the rays of objects along one axis, in C cells. A cell holds the rays of one object in a short time. The
     cells are in the order of their objects.
 
-    owner: (C,) the object. times: (C,) s. mean: (C,) rad, the mean angle by which the rays pass the object to the left, or
-    above it. white: (C,) rad, the standard deviation of the mean from noise that does not last. shift: (C, n) rad per m, the
-    derivative of the mean by n coordinates of the object. turn: (C, 3) rad, the error of the mean if the poses are turned
-    about each axis by one standard deviation. move: (C, 3) rad, the same if the poses are shifted along each axis. pull: (C,
-    3) m per rad, the derivative of the object's position by the mean.
+    owner: (C,) the object of each cell. times: (C,) s, the mean time of the rays. mean: (C,) rad, the mean angle by which
+    the rays pass the object to the left, or above it. white: (C,) rad, the standard deviation of the mean from noise that
+    does not last. shift: (C, n) rad per m, the derivative of the mean by n coordinates of the object. turn: (C, 3) rad, the
+    error of the mean if the poses are turned about each axis by one standard deviation. move: (C, 3) rad, the error of the
+    mean if the poses are shifted along each axis by one standard deviation. pull: (C, 3) m per rad, the derivative of the
+    object's position by the mean.
     """
 
     owner: Ints
@@ -58,11 +59,12 @@ class Cells:
         return Cells(*(column[which] for column in vars(self).values()))
 
     def alike(self, time: float) -> Floats:
-        """Return the correlations (C, C) of errors that last for `time`, s."""
+        """Return the correlations (C, C) of errors with the correlation time `time`, s."""
         return np.asarray(np.exp(-np.abs(self.times[:, None] - self.times) / time))
 
     def covariances(self, variances: Floats) -> tuple[Ints, Floats]:
-        """Return the objects (N,) that have cells, and the covariance (N, 3, 3) m^2 that lasting errors cause in each.
+        """Return the objects (N,) that have cells, and the covariance (N, 3, 3) m^2 that lasting errors add to each
+        position.
 
         variances: (2, T) as in `lasting_variances`.
         """
@@ -75,15 +77,15 @@ class Cells:
         return objects, found
 
     def _errors(self, squared: Floats) -> Floats:
-        """Return the covariances (C, C) rad^2 of the misses if all poses had one error. squared: (2,) the squared factors on
-        the noise of rotations and of places."""
+        """Return the covariances (C, C) rad^2 of the misses, if all poses have the same error. squared: (2,) the squared
+        factors on the noise of rotations and of places."""
         return np.asarray(squared[0] * self.turn @ self.turn.T + squared[1] * self.move @ self.move.T)
 
 
 @dataclass(frozen=True)
 class LastingNoise:
-    """The errors of given poses that last: the standard deviations of headings, rad, and of places, m, and for how long they
-    last, s. objects: the number of objects that show them."""
+    """The errors of given poses that last. yaw: rad, the standard deviation of headings. xy: m, the standard deviation of
+    places. seconds: the mean correlation time, s. objects: the number of objects that show the errors."""
 
     yaw: float
     xy: float
@@ -92,7 +94,8 @@ class LastingNoise:
 
     @classmethod
     def of(cls, cells: Cells, variances: Floats, yaw: float, place: float) -> "LastingNoise":
-        """Return the errors with squared factors (2, T), as in `lasting_variances`, on noise of `yaw` rad and `place` m."""
+        """Return the errors that belong to squared factors. variances: (2, T) as in `lasting_variances`. yaw, place: the
+        noise (rad, m) to which the factors apply."""
         turned, moved = np.sqrt(variances.sum(axis=1)).tolist()
         weight = variances.sum(axis=0)
         seconds = float(np.exp(weight @ np.log(TIMES) / weight.sum())) if weight.sum() > 0 else 0.0
@@ -100,12 +103,12 @@ class LastingNoise:
 
 
 def lasting_variances(cells: Cells) -> Floats:
-    """Return the expected squared factors (2, T) of the errors of rotations and of places that last for each of `TIMES`.
-    Their sums over these times are the squared factors of all errors.
+    """Return the expected squared factors (2, T) on the noise of rotations and of places, for each correlation time in
+    `TIMES`. The sum over the times is the squared factor of all lasting errors.
 
-    The prior of the factor is half-normal, with the scale 1. Its likelihood is restricted (Patterson and Thompson 1971): the
-    errors of the positions of all objects are integrated out. The mixture, the factor and the correlation time are averaged
-    over their posterior. SolveError if the likelihood is not finite.
+    The prior of the factor is half-normal, with the scale 1. The likelihood is restricted (Patterson and Thompson 1971),
+    which means that the errors of all positions are integrated out. The mixture, the factor and the correlation time are
+    averaged over their posterior. SolveError if the likelihood is not finite.
     """
     cells = cells.take(_counted(cells.times))
     from scipy.linalg.lapack import dpotrf, dsygst, dtrtrs  # Here, so that `load_libraries` comes first.
@@ -118,7 +121,7 @@ def lasting_variances(cells: Cells) -> Floats:
     kinds = [cells._errors(one) for one in np.eye(2)]
     for column, time in enumerate(TIMES):
         alike = cells.alike(time)
-        # The errors in units of what is known, L^-1 E L^-T. LAPACK makes the lower triangles, and reads columns.
+        # The errors in units of the known noise, L^-1 E L^-T. LAPACK makes the lower triangles, and reads columns.
         turned, moved = (dsygst((errors * alike).T, root, itype=1, lower=1, overwrite_a=1)[0] for errors in kinds)
         for row, (turns, moves) in zip(likelihood[:, column], _KINDS.tolist(), strict=True):
             row -= 0.5 * _misfits(turns * turned + moves * moved, mean, squared)
@@ -129,11 +132,12 @@ def lasting_variances(cells: Cells) -> Floats:
 
 
 def _misfits(covariance: Floats, mean: Floats, factors: Floats) -> Floats:
-    """Return -2 ln of the likelihood (F,), up to a constant, of a mean (C,) with covariance 1 + f times `covariance`, for
-    each of the factors f (F,).
+    """Return -2 ln of the likelihood (F,), up to a constant, for each factor f (F,). A mean (C,) has the covariance 1 + f
+    times `covariance`.
 
-    covariance: (C, C) symmetric. Only its lower triangle counts, and it is overwritten. It is made tridiagonal once, and all
-    factors together are one tridiagonal system. This takes a third of the time of eigenvalues with their vectors.
+    covariance: (C, C) symmetric. Only the lower triangle counts, and this call overwrites it. The matrix is made tridiagonal
+    once. Then all factors together are one tridiagonal system. This takes a third of the time of eigenvalues with their
+    vectors.
     """
     from scipy.linalg import eigh_tridiagonal
     from scipy.linalg.lapack import dormqr, dptsv, dsytrd, dsytrd_lwork  # Here, so that `load_libraries` comes first.
@@ -155,7 +159,8 @@ def _misfits(covariance: Floats, mean: Floats, factors: Floats) -> Floats:
 
 
 def _counted(times: Floats) -> Ints:
-    """Return the cells that count, ascending: all cells, or the cells of stretches that are spread evenly over the time."""
+    """Return the indices of the cells that count, in ascending order. These are all cells, or the cells of stretches that
+    are spread evenly over the time."""
     if len(times) <= _MOST:
         return np.arange(len(times))
     stretches = np.array_split(np.argsort(times, kind="stable"), -(-len(times) // _TOGETHER))

@@ -1,8 +1,8 @@
-"""The noise of given poses, from the errors that all rays of a frame share.
+"""Estimate the noise of given poses, from the errors that all rays of a frame share.
 
-A wrong heading of a pose turns all rays of its frame to one side, and a wrong place shifts them to one side. The noise of
-boxes does neither. So frames that show several objects reveal the noise of the poses, even if the noise of boxes is unknown.
-"""
+A wrong heading of a pose turns all rays of its frame to one side. A wrong place shifts them to one side. The noise of boxes
+differs from ray to ray. So frames that show several objects reveal the noise of the poses, even if the noise of boxes is
+unknown."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -19,37 +19,40 @@ from objslam.frontend.up import upright
 from objslam.graph.fixed_pose_triangulation import noise_of_poses
 
 _FEWEST = 4
-"""An object is used if it has at least this number of rays. Two of them determine its place. A larger number uses fewer
-objects."""
+"""The fewest rays of an object that is used. Two rays determine the place of the object. With a larger number, fewer objects
+are used."""
 _MOST_POSES = 500
-"""The most poses that count, spread evenly. They determine a factor to 3 %. More poses are more exact and slower."""
+"""The most poses that count, spread evenly. They determine a factor to 3 %. With a larger number, the factors are more
+exact, and the estimate is slower."""
 _BOUNDS = np.log([[0.4, 1.0, 1.0], [5.0, MOST_NOISE, MOST_NOISE]])
 """The logarithms of the least and largest factors on the noise of rays, headings and places. The noise of poses never falls
-below the settings: a few frames with small errors say nothing about the errors of the other frames. Wider bounds allow
-noisier poses."""
+below the settings, because a few frames with small errors say nothing about the other frames. With wider bounds, poses may
+be noisier."""
 _STEPS = (0.8, 0.4, 0.2, 0.1, 0.05, 0.025)
-"""The steps of the search, as logarithms of factors. A smaller last step is more exact and slower."""
+"""The steps of the search, as logarithms of factors. With a smaller last step, the search is more exact and slower."""
 _CHANCE = 1e-3
-"""The chance of a false alarm: poses that have the noise of the settings are found noisier. With a larger value, shorter
-logs can show noisy poses, and more good logs seem to have such poses."""
+"""The probability of a false alarm, which finds more noise in poses that have the noise of the settings. With a larger
+value, shorter logs can show noisy poses, but more good logs seem to have such poses."""
 _SIGNIFICANT = -2 * np.log(_CHANCE)
-"""The poses count as noisier if more noise lowers -2 ln of the posterior density by at least this value. It is the quantile
-of chi-squared that is exceeded with the probability `_CHANCE`. The 2 degrees of freedom are the noises of headings and of
-places."""
+"""The least amount by which more noise must lower -2 ln of the posterior density, so that the poses count as noisier. It is
+the quantile of chi-squared that is exceeded with the probability `_CHANCE`. There are 2 degrees of freedom: the noise of
+headings and the noise of places."""
 _STRAY = 3.0
-"""The deviation of a stray ray, in standard deviations of all noise together. A larger number lets false boxes raise the
-noise. A smaller number lowers the noise of true boxes: the number 3 lowers it by 1.3 %."""
+"""The least deviation of a stray ray, in standard deviations of all noise together. Stray rays do not count. With a larger
+number, false boxes raise the noise. With a smaller number, the noise of true boxes becomes too small. The number 3 lowers it
+by 1.3 %."""
 _ROUNDS = 4
-"""The most rounds in which stray rays are separated from noisy poses. More rounds hardly change a factor."""
+"""The most rounds that separate stray rays from noisy poses. More rounds hardly change a factor."""
 
 
 @dataclass(frozen=True)
 class _Sums:
     """Sums over the rays of each of K poses, in units of the nominal noise of rays.
 
-    shared: (K, 3, 3) the information about an error of the pose: heading (rad), x and y (m). pulled: (K, 3) this information
-    times the error that fits best. squares: the sum of the squared misses of all rays. rays: the number of rays. noise: (3,)
-    the nominal standard deviations of the error. prior: the weight of the nominal noise, as a number of residuals.
+    shared: (K, 3, 3) the information about the error of each pose in heading (rad), x and y (m). pulled: (K, 3) this
+    information times the error that fits best. squares: the sum of the squared misses of all rays. rays: the number of rays.
+    noise: (3,) the nominal standard deviations of the error in heading (rad), x and y (m). prior: the weight of the nominal
+    noise, as a number of residuals.
     """
 
     shared: Floats
@@ -76,11 +79,10 @@ def noise_in_frames(
 ) -> tuple[float, float]:
     """Return the factors (at least 1) on `localization.yaw` and `localization.xy` that agree best with the rays.
 
-    A variance component model (Searle, Casella and McCulloch 1992): seen from above, the miss of a ray is a sum of three
-    errors: the noise of the ray, the error of the heading of its pose, and the error of the place of its pose, as seen from
-    the object. The sizes of the three errors have the largest posterior density. Both factors are 1 unless the rays refute
-    the settings. Only poses with rays to two objects and more count, because a single ray does not show which of the three
-    errors it has.
+    This is a variance component model (Searle, Casella and McCulloch 1992). Seen from above, the miss of a ray is a sum of
+    three errors: the noise of the ray, the error of its pose's heading, and the error of its pose's place. The found sizes
+    of the three errors have the largest posterior density. Both factors are 1 unless the rays refute the settings. Only
+    poses with two rays or more count, because a single ray does not show which of the three errors it has.
 
     positions: (N, 3) m, NaN for an object without a position.
     """
@@ -97,7 +99,7 @@ def noise_in_frames(
     level = np.maximum(np.hypot(to[:, 0], to[:, 1]), MIN_DEPTH)
     left = np.column_stack([-to[:, 1], to[:, 0]]) / level[:, None]
     miss = (direction[:, :2] * left).sum(axis=1) / np.maximum(np.hypot(direction[:, 0], direction[:, 1]), 1e-6)
-    miss *= np.sqrt(number[owner] / (number[owner] - 2))  # The place of an object follows its own rays.
+    miss *= np.sqrt(number[owner] / (number[owner] - 2))  # The place of an object is fitted to its own rays.
     own = rays.sigma[held] * np.maximum(np.linalg.norm(to, axis=1), MIN_DEPTH) / level
     by_pose = np.column_stack([np.ones(len(held)), left / level[:, None]])
     yaw, place = noise_of_poses(replace(keyframes, pose_noise=(1.0, 1.0)), settings)
@@ -119,8 +121,9 @@ def noise_in_frames(
 
 
 def _summed(miss: Floats, by_pose: Floats, pose: Ints, noise: tuple[float, float], settings: Settings) -> _Sums:
-    """Return the sums over the rays of each pose. miss: (R,), by_pose: (R, 3) its derivative by the error of the pose, both
-    in standard deviations of the rays. noise: the noise of headings, rad, and of places, m."""
+    """Return the sums over the rays of each pose. miss: (R,) the misses. by_pose: (R, 3) the derivative of each miss by the
+    error of the pose. Both are in standard deviations of the rays. pose: (R,) the pose of each ray. noise: the noise of
+    headings (rad) and of places (m)."""
     count, pose = len(np.unique(pose)), np.unique(pose, return_inverse=True)[1]
     shared, pulled = np.zeros((count, 3, 3)), np.zeros((count, 3))
     np.add.at(shared, pose, by_pose[:, :, None] * by_pose[:, None, :])
@@ -139,7 +142,8 @@ def _most_likely(sums: _Sums) -> Floats:
 
 
 def of_several(keyframes: Keyframes, rays: Rays, held: Ints, most: int) -> tuple[Ints, Ints]:
-    """Return those of the rays `held` (n,) whose pose has several of them, and the number of the pose of each.
+    """Return the rays among `held` (n,) whose pose has several rays of `held`, and the number of the pose of each returned
+    ray.
 
     Keyframes with one stamp share a pose. most: the most poses that are kept, spread evenly.
     """
@@ -150,9 +154,11 @@ def of_several(keyframes: Keyframes, rays: Rays, held: Ints, most: int) -> tuple
 
 
 def least_cost(cost: Callable[[Floats], float], free: Bools, start: Floats, bounds: Floats) -> tuple[Floats, float]:
-    """Return the logarithms (n,) of factors with the least cost, and this cost, by steps along the axes that become smaller.
+    """Return the logarithms (n,) of factors with the least cost, and this cost. The search takes steps along the axes, which
+    become smaller.
 
-    free: (n,) which factors change. start: (n,) logarithms. bounds: (2, n) their least and largest values."""
+    free: (n,) which factors may change. start: (n,) the first logarithms. bounds: (2, n) the least and largest
+    logarithms."""
     best, least = start, cost(start)
     moves = np.concatenate([np.eye(len(start)), -np.eye(len(start))])[np.tile(free, 2)]
     for step in _STEPS:

@@ -1,4 +1,4 @@
-"""Estimate the noise of a log from the residuals of objects that were found from few boxes."""
+"""Estimate the noise of a log from the residuals of objects with few boxes."""
 
 from __future__ import annotations
 
@@ -14,30 +14,33 @@ from objslam.mapping.fixed.few_box_search import Searched, SparseNoise
 from objslam.mapping.fixed.pose_noise import least_cost
 
 _FAR = 10.0
-"""The prior standard deviation of an object's place, as a multiple of the largest distance of a ray. It gives a variance to
-the place of an object with a single ray. The number hardly matters if it is large."""
+"""The prior standard deviation of an object's place, as a multiple of the largest distance along a ray. With this prior, an
+object with a single ray has a finite variance. A large number hardly matters."""
 _OUTLIER = 3.0
-"""The deviation from which a residual does not count, after the first round. With a smaller limit, the noise becomes too
-small. With a larger one, wrong depths count."""
+"""The deviation, in standard deviations, from which a residual does not count after the first round. With a smaller limit,
+the noise becomes too small. With a larger limit, wrong depths count."""
 _LEFT = 0.5
-"""The error that a place still has after the search corrected it by its objects, as a share of the noise of the places. It
-only widens the limit for outliers, so a larger share rejects fewer residuals. On simulated streets it is 0.4 to 0.6."""
+"""The error of a place that is left after the search corrected the place, as a share of the noise of the places. It only
+widens the limit for outliers, so with a larger share, fewer residuals are rejected. On simulated streets it is 0.4 to
+0.6."""
 _ROUNDS = 3
-"""How often the noise is estimated, because outliers depend on it. A larger number is more exact and slower."""
+"""The number of rounds in which the noise is estimated. Several are needed, because the outliers depend on the noise. With a
+larger number, the noise is more exact, and the estimate is slower."""
 _MOST = (MOST_POSE_NOISE, 20.0, 20.0)
-"""The largest factors on the noise of places, depths and boxes. With the defaults of the settings, 20 is a depth that errs
-by 40 %, and a box that errs by 60 px. Larger factors take wrong input for noise."""
+"""The largest factors on the noise of places, depths and boxes. With the default settings, a factor of 20 means that a depth
+errs by 40 % and a box by 60 px. With larger factors, wrong input is taken for noise."""
 
 
 def noise_of_residuals(searched: Searched, unknown: tuple[bool, bool, bool], prior: float, *, shared: bool) -> SparseNoise:
-    """Return the noise of places, depths and boxes that agrees best with the residuals, by restricted likelihood (Patterson
-    and Thompson 1971).
+    """Return the noise of places, depths and boxes that agrees best with the residuals. It has the largest restricted
+    posterior density (Patterson and Thompson 1971).
 
     A place is the position of the robot at one moment. The residuals are seen from above. Across the ray, a residual comes
     from the noise of the box and of the place. Along the ray, it comes from the noise of the depth and of the place. The
-    objects and the errors of the places are integrated out. unknown: which of the three kinds of noise are estimated. prior:
-    the weight of the noise in the settings, as a number of residuals. shared: whether all rays of one moment have the same
-    error of their place. If not, each ray has its own error, and there are no outliers.
+    objects and the errors of the places are integrated out. unknown: whether the noise of places, of depths and of boxes is
+    estimated. prior: the weight of the noise in the settings, as a number of residuals. shared: whether all rays of one
+    moment have the same error of their place. If not, each ray has an error of its own, and no residual is left out as an
+    outlier.
     """
     residuals = _Residuals.of(searched)
     known, own = residuals.known, residuals.own
@@ -68,8 +71,8 @@ def noise_of_residuals(searched: Searched, unknown: tuple[bool, bool, bool], pri
 
 
 def gain_of_shared_places(searched: Searched) -> float:
-    """Return the log odds of two explanations: all rays of one moment share one error of their place, or each ray has
-    another error."""
+    """Return the log odds that all rays of one moment share one error of their place, against a separate error for each
+    ray."""
     if not len(searched.found.owner):
         return 0.0
     residuals = _Residuals.of(searched)
@@ -84,10 +87,12 @@ def gain_of_shared_places(searched: Searched) -> float:
 
 @dataclass(frozen=True)
 class _Residuals:
-    """The residuals of P rays, seen from above. The first of two rows is across a ray, and the second is along it.
+    """The residuals of P rays, seen from above. Each array has two rows: the first is across the ray, and the second is
+    along it.
 
-    axes: (2, P, 2). known: (2, P) whether there is a residual. now: (2, P) m, from the corrected place. miss: (2, P) m, from
-    the given place. own: (2, P) m^2, the variance of the ray and of its range in the settings.
+    axes: (2, P, 2) the unit vectors. known: (2, P) whether there is a residual. now: (2, P) m, the residuals from the
+    corrected places. miss: (2, P) m, the residuals from the given places. own: (2, P) m^2, the variances of the ray and of
+    its range in the settings. far: m^2, the prior variance of an object's place.
     """
 
     searched: Searched
@@ -113,12 +118,13 @@ class _Residuals:
         return cls(searched, axes, known, now, miss, own, (_FAR * level.max(initial=1.0)) ** 2)
 
     def system(self, place: Ints) -> _System:
-        """Return the normal equations if the rays have these places (P,)."""
+        """Return the normal equations. place: (P,) the number of each ray's place. Rays with the same number share an
+        error."""
         return _System(self.axes, self.miss, self.searched.found.owner, place, self.searched.place**2, self.far)
 
 
 class _System:
-    """The normal equations of objects and places, seen from above. Both are corrections of present estimates, in m.
+    """The normal equations for corrections (m) of objects and places, seen from above.
 
     axes: (2, P, 2) unit vectors across and along each ray. miss: (2, P) m, by how much each ray misses its object. owner,
     place: (P,) the object and the place of each ray. nominal: m^2, the variance of a place at the factor 1. far: m^2, the
@@ -136,9 +142,10 @@ class _System:
         self.second = order[np.repeat(begin[self.place[order]], mates) + step]
 
     def solve(self, weight: Floats, factor2: float) -> tuple[float, Floats]:
-        """Return -2 ln of the restricted likelihood without the terms of the rays' own noise, and the residuals (2, P), m.
+        """Return -2 ln of the restricted likelihood, and the residuals (2, P), m. The likelihood lacks the terms of the
+        rays' own noise.
 
-        weight: (2, P) m^-2. factor2: the squared factor on the noise of the places.
+        weight: (2, P) m^-2, one over the variance of each residual. factor2: the squared factor on the noise of the places.
         """
         prior, eye = self.nominal * factor2, np.eye(2)
         each = np.einsum("ap,api,apj->pij", weight, self.axes, self.axes)

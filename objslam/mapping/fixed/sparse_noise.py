@@ -1,10 +1,9 @@
 """Estimate the noise of a log that sees each thing from few places, such as a street past which a car with GPS drives.
 
-With the usual noise, the rays of such a log do not meet, and nothing is found whose residuals could show the noise. So the
-objects are searched with many noises. The noise with the most evidence counts: the odds of the objects over stray boxes, and
-how likely their detections and misses are. This is rough. So the noise is then taken from the residuals of the objects
-(`residual_noise`), from several starts.
-"""
+With the usual noise, the rays of such a log do not meet, and no objects are found whose residuals could show the noise. So
+objects are searched with many assumed noises, and the noise with the most evidence is taken. The evidence is the odds of the
+objects over stray boxes, and how likely their detections and misses are. The result is rough. So the noise is then estimated
+from the residuals of the objects (`residual_noise`), from several starts."""
 
 from __future__ import annotations
 
@@ -28,46 +27,48 @@ from objslam.mapping.fixed.residual_noise import gain_of_shared_places, noise_of
 from objslam.mapping.progress import Progress
 
 _PLACES = (1.0, 2.0, 6.0, 20.0, 60.0, 200.0)
-"""The factors on `localization.xy` that are tried first. More factors find more, and take longer."""
+"""The factors on `localization.xy` that are tried first. With more factors, the noise of more logs is found, and the search
+takes longer."""
 _RANGES = (1.0, 3.0, 8.0)
-"""The factors on the noise of depths that are tried first."""
+"""The factors on the noise of depths that are tried first. With more factors, the search takes longer."""
 _RAYS = (1.0, 4.0)
 """The factors on the noise of rays that are tried first. On a street, noisy rays look almost like noisy places."""
 _TURN = 15
-"""The steps (degrees) of the tried turns of all cameras about the vertical axis. A larger step misses more wrong mounts."""
+"""The step (degrees) between the tried turns of all cameras about the vertical axis. With a larger step, more wrong mounts
+are missed."""
 _LEAD = 15.0
-"""The least lead, in log odds, of the log as it is over the log with turned cameras. On streets the lead is 18 and more.
-With cameras turned by 15 degrees and more, it is below 0 on streets, and mostly in rooms too. With a larger lead, fewer
-streets are mapped. With a smaller one, wrong mounts are taken for noise."""
+"""The least lead, in log odds, of the log as it is over the log with turned cameras. On streets, the lead is 18 and more. If
+a mount is wrong by 15 degrees and more, the lead is below 0 on streets, and mostly in rooms too. With a larger lead, fewer
+streets are mapped. With a smaller lead, wrong mounts are taken for noise."""
 _SURE = 60.0
-"""From this lead on, the boxes agree, even if they seem to disagree because each thing has only few boxes. With a larger
-lead, more right streets with few boxes are called wrong."""
+"""The lead, in log odds, from which a finding that the boxes disagree is dropped. The boxes may only seem to disagree,
+because each thing has few boxes. With a larger lead, more right streets with few boxes count as wrong."""
 _BETTER = 40.0
-"""The input counts as wrong if the log with a usual mistake corrected leads the log as it is by this or more, in log odds. A
-straight street looks like its mirror image. So the correction of a mistake that is not there leads by up to 25, by chance.
-With a larger value, mistakes are sooner taken for noise."""
+"""The least lead, in log odds, of the log with a usual mistake corrected over the log as it is, so that the input counts as
+wrong. A straight street looks like its mirror image. So the correction of a mistake that is not there leads by up to 25, by
+chance. With a larger value, mistakes are more often taken for noise."""
 _MOST_VIEWS = 12.0
-"""The most boxes that an object may have on average. The streets have 4. If objects with more boxes still disagree, wrong
-input is likelier than noise, because their frames would show the noise. With a larger number, a turned camera is sooner
-taken for noisy places."""
+"""The largest mean number of boxes of an object in a log that sees each thing from few places. Streets have 4. If objects
+with more boxes still disagree, wrong input is likelier than noise, because the frames would show the noise. With a larger
+number, a turned camera is more often taken for noisy places."""
 _FEWEST = 20
 """The fewest boxes of a log that is searched. Fewer boxes agree with any noise by chance."""
 _NEAR = 30.0
-"""A noise is tried as a start if its log odds are at most this far below the log odds of the likeliest noise. With a larger
-number, more starts are tried, and each takes about a second."""
+"""The largest distance, in log odds, from the likeliest noise to a noise that is tried as a start. With a larger number,
+more starts are tried, and each takes about a second."""
 _NOISY = 3.0
-"""Places count as noisy from this factor on `localization.xy` on. If any start leads to noisy places, results with more
-exact places are left out. They explain the boxes by large errors of the boxes instead. Such errors are rare, and the sigmas
-would be too small. With a larger factor, a good GPS is taken for a bad detector."""
+"""The least factor on `localization.xy` at which places count as noisy. If any start leads to noisy places, results with
+more exact places are left out. Those results explain the misses by large errors of the boxes. Such errors are rare, and the
+sigmas would be too small. With a larger factor, noisy places are more often taken for a bad detector."""
 _SETTLED = 2
-"""How often the objects are searched with the noise of their residuals. A third time gave the same objects on 15 simulated
-streets. A larger number takes longer."""
+"""The number of searches with noise that was estimated from the residuals of all rays of a moment. A third search gave the
+same objects on 15 simulated streets. With a larger number, the run takes longer."""
 _OTHERS = 2
-"""The number of likeliest noises that are tried if the log with the first one has wrong input. With a larger number, wrong
-input is sooner taken for noise."""
+"""The number of likeliest noises that are tried if the input seems wrong with the first noise. With a larger number, wrong
+input is more often taken for noise."""
 _CLEAR = 20.0
-"""The least growth of the log odds over stray boxes. Dozens of noises are tried, so the odds must grow by far more than by
-chance. With a larger value, a street needs more boxes."""
+"""The least growth of the log odds of objects over stray boxes, from the noise in the settings to another noise. Dozens of
+noises are tried, so some growth is chance. With a larger value, a street needs more boxes."""
 
 
 def with_sparse_noise(
@@ -75,9 +76,9 @@ def with_sparse_noise(
 ) -> tuple[Settings, Diagnosis]:
     """Return settings with the noise of a log whose boxes disagree only because the settings say too little noise.
 
-    diagnosis: of the log with the noise in the settings. If another noise lets the boxes agree, the returned diagnosis is of
-    the log with this noise, and says so. If few boxes of each thing agree with the noise in the settings, the finding that
-    they disagree is taken back. With much noise in the settings, the diagnosis may get a finding: the cameras are turned.
+    diagnosis: the findings about the log with the noise in the settings. If the boxes agree with another noise, the returned
+    diagnosis is of the log with this noise, and says so. If the boxes agree with the noise in the settings, the finding that
+    they disagree is dropped. If the settings have much noise, the diagnosis may get the finding that the cameras are turned.
     Otherwise the settings and the diagnosis are returned unchanged.
     """
     boxes = sum(len(one.detections) for one in log.cameras if one.detections is not None)
@@ -114,10 +115,10 @@ def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[tupl
     """Return the noise of a log's places, depths and boxes with which its boxes show objects at the given poses.
 
     Also return the lead, in log odds, of the log as it is over the log with turned cameras. Several noises may be about as
-    likely as the likeliest one. Of these, the one with the noisiest places comes first. The others follow, from the
-    likeliest on. The list is empty if no noise explains most of the boxes, far better than chance and than the noise in the
-    settings. Only noise that the settings let a run estimate is changed. Without depths, the noise in the settings is the
-    only one: with noisy places, bearings meet anywhere.
+    likely as the likeliest one. Among them, the one with the noisiest places comes first. The others follow, with the
+    likeliest first. The tuple is empty if no noise explains most of the boxes far better than chance and than the noise in
+    the settings. Only noise that the settings let a run estimate is changed. Without depths, only the noise in the settings
+    is tried, because with noisy places bearings meet anywhere.
     """
     part = middle(log)
     places, depths, boxes = _unknown(part, settings)
@@ -140,26 +141,26 @@ def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[tupl
             return (), 0.0
     if nominal or not places:
         return (best.noise,), lead
-    # The first search hardly tells noises apart. So each noise of places that is about as likely is a start.
+    # The first search hardly distinguishes noises. So each noise of places that is about as likely is a start.
     near = [one for one in sorted(searched, key=lambda one: one.value) if one.value > best.value - _NEAR]
     starts = {one.noise.place: one for one in near}
     found = [each for one in starts.values() for each in _settled(part, settings, one, (places, depths, boxes))]
     found = [one for one in found if one.noise.place >= _NOISY] or found
     found.sort(key=lambda one: -one.value - gain_of_shared_places(one))
     evidence = [one.value + gain_of_shared_places(one) for one in found]
-    # Of noises that are about as likely, the one with the noisiest places gives the largest sigmas.
+    # Among noises that are about as likely, the one with the noisiest places gives the largest sigmas.
     about = [one.noise for one, value in zip(found, evidence, strict=True) if value > evidence[0] - _LEAD]
     noisiest = max(about, key=lambda one: one.place)
     return (noisiest, *[one.noise for one in found[:_OTHERS] if one.noise != noisiest]), lead
 
 
 def _settled(part: Log, settings: Settings, searched: Searched, unknown: tuple[bool, bool, bool]) -> list[Searched]:
-    """Search the objects of a part of a log and estimate the noise from their residuals, in turns.
+    """Search objects in a part of a log, and estimate the noise from their residuals. Both steps alternate.
 
-    The result of each turn is returned, because the noise of boxes may grow until it replaces the noise of places. A search
-    with too little noise leaves out the rays that miss by much. So the first estimate treats the error of a place as if each
-    ray had its own error. This makes the noise rather too large. The next search then finds the errors of the places.
-    unknown: whether the noise of places, depths and boxes is estimated.
+    Return the result of each search, because the noise of boxes may grow until it replaces the noise of places. A search
+    with too little noise leaves out the rays that miss by much. So the first estimate gives each ray an error of its own,
+    and the noise becomes rather too large than too small. The next search then finds the errors of the places. unknown:
+    whether the noise of places, depths and boxes is estimated.
     """
     prior = settings.noise.prior
     noise = noise_of_residuals(searched, (True, False, False), prior, shared=False)
@@ -175,7 +176,8 @@ def _settled(part: Log, settings: Settings, searched: Searched, unknown: tuple[b
 def _turned_cameras(log: Log, settings: Settings, progress: Progress) -> Finding | None:
     """Return a finding if the objects have far more evidence with all cameras turned about the vertical axis.
 
-    Other checks compare single rays, and with noise of this size rays meet anywhere. None if an object has many boxes.
+    The settings have much noise here. Other checks compare single rays, and with much noise, rays meet anywhere. The result
+    is None if objects have many boxes.
     """
     part, tried = middle(log), range(0, 360, _TURN)
     values = []
@@ -213,9 +215,8 @@ def _unknown(log: Log, settings: Settings) -> tuple[bool, bool, bool]:
 def _what_ifs(log: Log, progress: Callable[[int, int], None]) -> Iterator[tuple[Log, bool]]:
     """Yield changed copies of a log: with all cameras turned about the vertical axis, or with one usual mistake corrected.
 
-    Each copy comes with a flag, which says whether its cameras are turned. Only mistakes about directions are tried. Errors
-    of the clock and of the size of images are left out, because they move rays by little, or move all places in the same
-    way.
+    Each copy comes with a flag that says whether its cameras are turned. Only mistakes about directions are tried. Wrong
+    clocks and wrong sizes of images are left out, because they move rays by little, or move all places in the same way.
     """
     usual = [one for one in coarse_hypotheses(log) if one.usual]
     turns = range(_TURN, 360, _TURN)

@@ -35,18 +35,17 @@ if TYPE_CHECKING:
     from objslam.mapping.joint.joint_alternation import JointState
 
 _FAILURES = 2
-"""No more labels are tried after this number of labels in a row that do not agree. Each try takes a solve, and later labels
-fit worse. With a larger number, fewer labels are left out by mistake."""
+"""The number of consecutive labels that do not agree, after which no more labels are tried. Each try takes a solve, and
+later labels fit worse. With a larger number, fewer labels are left out by mistake."""
 
 
 @dataclass(frozen=True)
 class Named:
     """A map with one object for each label.
 
-    state: the solved map. agree: whether the rays agree with it. others: the map without the labels that scatter, if all
-    other labels are names. None if there is no such map, or if it is not sure. doubtful: the map without the labels that
-    scatter, if some of the other labels may name several objects. These labels are not in `others`. None if no label is
-    doubted.
+    state: the solved map. agree: whether the rays agree with this map. others: the map without the labels that scatter and
+    without doubted labels. It is None if there is no such map, or if it is not sure. doubtful: the map without the labels
+    that scatter, but with the doubted labels, which may name several objects. It is None if no label is doubted.
     """
 
     state: JointState
@@ -64,7 +63,7 @@ def by_label(state: JointState) -> Named:
         return Named(solved, True)
     told = labels_tell(association, solved.estimate)
     if told and not scatter_alone(solved).any():
-        # Two boxes of a label in a frame: no noise causes that.
+        # No noise causes two boxes of a label in one frame.
         return Named(*_with_doubles(solved)) if (association.object < 0).any() else Named(solved, True)
     # If the settings have too little noise, true rays are rejected. So more noise is tried before labels are left out.
     if not told and not (association.object < 0).any() and _has_fixed_noise(solved):
@@ -79,12 +78,13 @@ def by_label(state: JointState) -> Named:
 
 
 def at_other_labels(state: JointState, others: JointState) -> JointState | None:
-    """Return the state after rounds at the path that the labels show which agree. None if no solve is possible.
+    """Return the state after rounds that begin at the path which the agreeing labels show. Return None if no solve is
+    possible.
 
-    At this path, the rounds find the objects of the labels that scatter, if they have any. So the log need not be explored,
-    which takes longer. The labels that agree stay names, unless their boxes show a second object. The noise stays as it is:
-    with more noise, the path would bend to things that move. state: before the solve by labels. others: the map of the
-    labels that agree.
+    At this path, the rounds find the objects of the labels that scatter, if there are such objects. So no exploration is
+    needed, which would take longer. The labels that agree stay names, unless their boxes show a second object. The noise is
+    not estimated again, because with more noise the path would bend to things that move. state: before the solve by labels.
+    others: the map of the labels that agree.
     """
     assert others.association is not None
     assert others.estimate is not None
@@ -97,16 +97,17 @@ def at_other_labels(state: JointState, others: JointState) -> JointState | None:
 
 
 def _with_known_noise(errors: SharedErrors) -> SharedErrors:
-    """Return the same measurements with no kind of noise unknown."""
+    """Return the same shared errors, with settings in which all noise is known."""
     known = dict.fromkeys(("rays", "ranges", "odometry", "localization"), False)
     noise = errors.settings.noise.model_copy(update=known)
     return replace(errors, settings=errors.settings.model_copy(update={"noise": noise}))
 
 
 def _with_other_start(state: JointState, solved: JointState) -> tuple[JointState, bool]:
-    """Return the state solved with the noise or the clock with which labels are names, and whether there is one.
+    """Return the state after a solve at other noise or another clock at which labels are names. Also return whether there is
+    such noise or such a clock.
 
-    state: before the solve by labels. solved: after it. It rejects many rays.
+    state: before the solve by labels. solved: after this solve, which rejected many rays.
     """
     association, errors = solved.association, state.errors
     assert association is not None
@@ -150,14 +151,14 @@ def _with_doubles(state: JointState) -> tuple[JointState, bool]:
 
 
 def _of_labels_that_agree(state: JointState, named: JointState) -> tuple[JointState | None, JointState | None]:
-    """Return the map of the labels that agree with each other, without doubted ones, and the map that has the doubted too.
+    """Return two maps of the labels that agree with each other: one without doubted labels, and one with them.
 
-    Rays of a thing that moves bend the path, and then rays of other labels are rejected as well. So a label may scatter only
-    at the path without the first ones, and a label that scattered may agree there. These labels are tried once more, one
-    after another, and first the one that fits best, because each label that agrees improves the path. Labels that are
-    doubted at last are left out as well. The first map is None if the remaining labels do not show the path (`_show_path`).
-    The second map has the labels before any was left out because of a doubt, None if there was no doubt. state: before the
-    solve by labels. named: after it.
+    Rays of a thing that moves bend the path, and then rays of other labels are rejected as well. Without the labels that
+    scatter, the path changes. Other labels may scatter at the new path, and labels that scattered may agree. So these are
+    tried once more, one after another. The label that fits best comes first, because each label that agrees improves the
+    path. At the end, doubted labels are left out as well. The first map is None if the remaining labels do not show the path
+    (`_show_path`). The second map has the labels before any was left out because of a doubt. It is None if there was no
+    doubt. state: before the solve by labels. named: after it.
     """
     solved, best, doubtful = named, None, None
     tried, failed = np.zeros(0, dtype=np.int64), 0
@@ -196,12 +197,12 @@ def _of_labels_that_agree(state: JointState, named: JointState) -> tuple[JointSt
 
 
 def _path_of(state: JointState, some: Association) -> Floats | None:
-    """Return the camera poses (K, 4, 4) after a solve of the keyframes that show objects of an association. None if all
-    keyframes do, or if there is a localisation.
+    """Return the camera poses (K, 4, 4) after a solve of the keyframes that show objects of an association. Return None if
+    all keyframes show objects, or if there is a localisation.
 
-    A solve without a localisation begins at a graph that grows by a number of keyframes at a time. Keyframes that show only
-    a thing that moves would count too. Then the graph may end in a wrong minimum, in which no solve without them ends.
-    state: before the first solve.
+    A solve without a localisation begins with a graph that grows by some keyframes at a time. Keyframes that show only a
+    thing that moves would count too. They may lead the graph to a wrong minimum. A solve without these keyframes does not
+    end there. state: before the first solve.
     """
     shown = some.object >= 0
     if state.keyframes.localized_every or len(np.unique(state.rays.keyframe[shown])) == len(state.keyframes):
@@ -220,7 +221,7 @@ def _path_of(state: JointState, some: Association) -> Floats | None:
 
 
 def _by_fit(solved: JointState) -> Ints:
-    """Return the labels of rays that meet at the path of a map of some labels, and first those whose rays fit best."""
+    """Return the labels whose rays meet at the path of a map of some labels. The labels whose rays fit best come first."""
     from objslam.graph.fixed_pose_triangulation import triangulate_at
 
     association = associate_by_label(solved.rays)
@@ -231,7 +232,7 @@ def _by_fit(solved: JointState) -> Ints:
 
 
 def _of_labels(named: JointState, labels: Ints) -> Association:
-    """Return the association of a map with one object for each label, for some labels only."""
+    """Return the association of a map with one object for each label, reduced to some labels."""
     before = named.association
     assert before is not None
     stays = np.isin(before.label, labels)
@@ -240,8 +241,8 @@ def _of_labels(named: JointState, labels: Ints) -> Association:
 
 
 def _show_path(named: JointState, labels: Ints) -> bool:
-    """Return whether some labels show the path: they are `OTHERS`, and enough of them are seen at each moment
-    (`unchecked_labels`), unless there is a localisation."""
+    """Return whether some labels show the path. At least `OTHERS` labels need `MANY` rays each. Without a localisation,
+    enough of the labels must also be seen at each moment (`unchecked_labels`)."""
     rays = named.rays
     of_them = np.isin(rays.label, labels)
     if (np.bincount(rays.label[of_them]) >= MANY).sum() < OTHERS:

@@ -1,4 +1,4 @@
-"""Rays of one label that can show no single place, which tells without a solve that labels do not name objects."""
+"""Find labels that name several objects, without a solve: their rays cannot show a single place."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from objslam.core.types import Keyframes, Rays
 from objslam.frontend.tracks import associate_tracks
 
 _SOON = 3.0
-"""The longest time (s) between two rays that are compared. In a longer time, the odometry may turn by too much. In a shorter
+"""The longest time (s) between two rays that are compared. In a longer time, the odometry may err by too much. In a shorter
 time, the robot sees fewer things of a label."""
 _APART = np.radians(20.0)
-"""Two rays diverge if one of them must turn by more than this angle (rad) to meet the other. Errors of clock, camera and
-odometry turn rays too. In six recorded drives with names, with clocks that were off by up to 1 s or turns by 20 %, at most
-one pair of a drive was beyond it, and up to 4 pairs were beyond 15 degrees. A larger angle finds fewer labels of several
-things."""
+"""The angle (rad) by which one ray must at least turn to meet another, so that the two diverge. Errors of clock, camera and
+odometry turn rays too. Six recorded drives with names were tested with clocks off by up to 1 s, or turns off by 20 %. At
+most one pair of a drive exceeded this angle, and up to 4 pairs exceeded 15 degrees. With a larger angle, fewer labels of
+several things are found."""
 _MANY, _SHARE = 5, 0.1
-"""A label diverges if at least `_MANY` of its pairs diverge, and more than the share `_SHARE` of them. In six recorded
-drives, five labels for 15 to 17 things had 44 to 712 such pairs. Larger values find fewer labels."""
+"""The least number and the share of a label's pairs that must diverge, so that the label diverges. In six recorded drives,
+15 to 17 things were given five labels. These had 44 to 712 such pairs. With larger values, fewer labels are found."""
 _MOST = 0.5
-"""Labels are no names if the labels that diverge are at least this share of the labels with `_MANY` rays, and have at least
-this share of the rays. Rays to things that move diverge too, but seldom to half of the labels. A larger share tries more
-maps of names, each of which takes a solve of up to a minute."""
+"""The least share of diverging labels among the labels with `_MANY` rays, so that labels are no names. They must also have
+at least this share of the rays. Rays to things that move diverge too, but seldom for half of the labels. With a larger
+share, more maps of names are tried. Each takes a solve of up to a minute."""
 
 
 def labels_diverge(keyframes: Keyframes, rays: Rays) -> bool:
     """Return whether the labels of most rays diverge, so that they name no single objects at rest.
 
-    A robot that looks from one chair to another sees two rays of the label within seconds, and the odometry knows how far it
-    turned. If the rays diverge, no place is on both. Only rays of tracks are compared, because false boxes are single. A ray
-    is compared with the ray of its label before it, if that ray is in another track.
+    A robot that looks from one chair to another has two rays of the label within seconds, and the odometry knows how far it
+    turned. If the rays diverge, no place is on both rays. Only rays of tracks are compared, because false boxes are single.
+    A ray is compared with the previous ray of its label, if that ray is in another track.
 
-    keyframes: with odometry. Without it, or without rays, the result is False.
+    The result is False without odometry or without rays.
     """
     if keyframes.odom_T_base is None or not len(rays):
         return False
@@ -48,7 +48,8 @@ def labels_diverge(keyframes: Keyframes, rays: Rays) -> bool:
 
 
 def _pairs(keyframes: Keyframes, rays: Rays) -> tuple[Ints, Floats]:
-    """Return the label (P,) of each compared pair of rays, and the angle (P,), rad, by which the pair misses one place."""
+    """Return the label (P,) of each compared pair of rays, and the angle (P,) in rad by which the two rays miss each
+    other."""
     assert keyframes.odom_T_base is not None
     track, time = associate_tracks(keyframes, rays).object, keyframes.stamps[rays.keyframe]
     some = np.flatnonzero(track >= 0)
@@ -61,11 +62,11 @@ def _pairs(keyframes: Keyframes, rays: Rays) -> tuple[Ints, Floats]:
 
 
 def angles_to_ray(origin: Floats, direction: Floats, seen_from: Floats, look: Floats) -> Floats:
-    """Return the smallest angles (P,), rad, between other rays and the places on a ray.
+    """Return the smallest angle (P,), rad, between the other ray of each pair and the places on the first ray.
 
-    From another origin, the places on a ray lie on an arc, from the direction of the ray's origin to the direction of the
-    ray. origin, direction: (P, 3) of the ray. seen_from, look: (P, 3) origin and direction of the other ray. Origins are in
-    m, and directions are unit vectors.
+    Seen from the other origin, the places on the first ray lie on an arc. The arc goes from the direction of the first ray's
+    origin to the direction of the first ray. origin, direction: (P, 3) of the first ray. seen_from, look: (P, 3) origin and
+    direction of the other ray. Origins are in m, and directions are unit vectors.
     """
     back = origin - seen_from
     far = lengths(back)[:, None]

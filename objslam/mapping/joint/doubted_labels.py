@@ -25,32 +25,35 @@ if TYPE_CHECKING:
 
 _WITNESSES = 2
 """The least number of other labels that must be seen before and after a moment, to check a label at this moment. The places
-of two objects fix a motion on the floor, so that the path between them cannot bend. With fewer, a bend can bring two things
-to one place. A larger number doubts the labels of more logs. MRCLAM and Lost in the Woods have 2 and more everywhere."""
+of two objects fix a motion on the floor, so the path cannot bend at this moment. With fewer objects, a bend can bring two
+things to one place. With a larger number, labels of more logs are doubted. MRCLAM and Lost in the Woods have 2 and more
+everywhere."""
 _GREW = 1.2
-"""Labels are doubted if a solve finds a larger factor than this on the noise of the odometry. A bent path needs such noise.
-In simulated drives with a turn on the spot and two things of one label, the factor was 1.5 to 6, and mostly 4. With one
-thing for each label and the odometry of the settings, it was at most 1.1. A larger factor doubts fewer labels."""
+"""The factor on the noise of the odometry above which labels are doubted. A bent path needs such noise. In simulated drives
+with a turn on the spot and two things of one label, the factor was 1.5 to 6, and mostly 4. With one thing for each label and
+the odometry of the settings, it was at most 1.1. With a larger factor, fewer labels are doubted."""
 _MISSED, _TAIL = 1.5, 0.9
-"""All labels are doubted if, in a solve with noisy odometry, single boxes miss by more than `_MISSED` times their nominal
-noise. If several labels have two objects each, they cannot check one another, but their boxes miss. The miss is read from
-the share `_TAIL` of the boxes, because a bent path lets some boxes fit well. With one thing for each label, simulated rigs
-of three cameras miss by 0.7 to 0.9, and six drives with two labels of two things by 1.9 to 4.7. A larger `_MISSED` doubts
-fewer labels, and a smaller one explores more logs without need. A larger `_TAIL` takes wrong names for noise."""
+"""`_MISSED` is the multiple of their nominal noise by which single boxes must miss in a solve with noisy odometry, so that
+all labels are doubted. If several labels have two objects each, they cannot check one another, but their boxes miss. `_TAIL`
+is the quantile of the misses that is compared, because a bent path lets some boxes fit well. With one thing for each label,
+simulated rigs of three cameras miss by 0.7 to 0.9. Six drives with two labels of two things miss by 1.9 to 4.7. With a
+larger `_MISSED`, fewer labels are doubted. With a smaller one, more logs are explored without need. With a larger `_TAIL`,
+wrong names are taken for noise."""
 _NOISY_BOXES = 2.0
-"""A map needs noisy boxes if a solve finds a larger factor than this on their noise. The recorded wheel robots have 0.5 to
-1.2 with one thing for each label. A larger factor trusts more maps with one object for each label."""
+"""The factor on the noise of boxes above which a map needs noisy boxes. The recorded wheel robots have 0.5 to 1.2 with one
+thing for each label. With a larger factor, more maps with one object for each label are trusted."""
 _REJECTED = 0.1
-"""A label is doubted if at least `MANY` of its rays, and at least this share, are rejected. A larger share doubts fewer
-labels. In a smaller share, a second object cannot be distinguished from wrong names and false boxes."""
+"""The least share of a label's rays that must be rejected, so that the label is doubted. At least `MANY` rays must be
+rejected too. With a larger share, fewer labels are doubted. With a smaller share, wrong names and false boxes look like a
+second object."""
 _NOISIER = 1.5
-"""A map with one object for each label may need this multiple of the noise of boxes or depths that a map with several
-objects needs. A larger factor favours one object for each label."""
+"""The largest noise of boxes or depths that a map with one object for each label may need, as a multiple of the noise that a
+map with several objects needs. A larger factor favours one object for each label."""
 
 
 CLEAR_ODDS = 7.0
-"""The evidence is clear if the log of the odds is above this: 1000 to 1. Bent paths of simulated drives had 107 and more.
-With a larger value, more maps need a look."""
+"""The natural log of the odds above which evidence is clear. It means odds of about 1000 to 1. Bent paths of simulated
+drives had 107 and more. With a larger value, more labels stay doubted."""
 
 
 def doubted_names(state: JointState | Solution) -> tuple[str, ...]:
@@ -71,7 +74,7 @@ def has_several(other: JointState, named: JointState) -> bool:
 
 
 def has_labels_of(one: JointState, other: JointState) -> bool:
-    """Return whether a map has an object for each label that has one in another map."""
+    """Return whether the map `one` has an object for each label that has an object in the map `other`."""
     assert one.association is not None
     assert other.association is not None
     return bool(np.isin(other.association.label, one.association.label).all())
@@ -80,7 +83,8 @@ def has_labels_of(one: JointState, other: JointState) -> bool:
 def needs_noisy_boxes(named: JointState, other: JointState) -> bool:
     """Return whether the map `named`, with one object for each label, needs far noisier boxes than another map of the log.
 
-    Then `named` is not trusted, even if `other` has less evidence. The exploration of `other` may only have missed a thing.
+    If so, `named` is not trusted, even if `other` has less evidence, because the exploration of `other` may have missed a
+    thing.
     """
     assert named.errors is not None
     assert other.errors is not None
@@ -116,10 +120,12 @@ def doubted_labels(rays: Rays, association: Association, keyframes: Keyframes, e
 
 
 def _missed(rays: Rays, association: Association, keyframes: Keyframes, estimate: Estimate, factor: float) -> float:
-    """Return by which multiple of their nominal noise single boxes miss: a quantile of their angles, over Rayleigh's.
+    """Return the multiple of their nominal noise by which single boxes miss. It is a quantile of their angles, divided by
+    the same quantile of a Rayleigh distribution.
 
-    The factor on the noise of rays is larger if boxes of one thing err alike for seconds, as boxes beside their things do.
-    Several cameras show this, because they hold each pose. Two things do not. factor: the one that is in the rays' sigmas.
+    The estimated factor on the noise of rays would be no such measure. It also grows if boxes of one thing err alike for
+    seconds, as boxes beside their things do. Several cameras show this, because together they fix each pose. factor: the
+    factor that the sigmas of the rays contain.
     """
     held = association.object >= 0
     origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
@@ -131,13 +137,11 @@ def _missed(rays: Rays, association: Association, keyframes: Keyframes, estimate
 def unchecked_labels(rays: Rays, keyframes: Keyframes) -> Ints:
     """Return the labels for which too few other labels (`_WITNESSES`) could show a second object.
 
-    The rays of a label are divided at a moment, so that each part is large enough for an object of its own. Another label is
-    a witness if it has rays before and after this moment. A label is unchecked if it has such a moment with too few
-    witnesses.
+    A moment divides the rays of a label in two parts. Only moments count at which each part is large enough for an object.
+    Another label is a witness if it has rays before and after the moment. A label is unchecked if there is a moment with too
+    few witnesses.
 
-    Args:
-        rays: the rays, with their labels.
-        keyframes: the keyframes of the rays.
+    Args: rays: the rays, with their labels. keyframes: the keyframes of the rays.
     """
     stamps = keyframes.stamps[rays.keyframe]
     order = np.lexsort((stamps, rays.label))
@@ -145,7 +149,7 @@ def unchecked_labels(rays: Rays, keyframes: Keyframes) -> Ints:
     labels, first, number = np.unique(rays.label[order], return_index=True, return_counts=True)
     enough = number >= 2 * MANY
     labels, first, number = labels[enough], first[enough], number[enough]
-    begin, end = at[first + MANY - 1], at[first + number - MANY]  # Between them, a label has rays before and after.
+    begin, end = at[first + MANY - 1], at[first + number - MANY]  # Between the two, a label has rays before and after.
     part = np.maximum(MANY, np.ceil(SECOND * number).astype(np.int64))
     changes = np.sort(np.concatenate([begin, end]))
     begin, end = np.sort(begin), np.sort(end)
@@ -153,24 +157,22 @@ def unchecked_labels(rays: Rays, keyframes: Keyframes) -> Ints:
     for label, low, high in zip(labels.tolist(), at[first + part - 1], at[first + number - part], strict=True):
         moments = np.append(low, changes[np.searchsorted(changes, low, "right") : np.searchsorted(changes, high)])
         seen = np.searchsorted(begin, moments, "right") - np.searchsorted(end, moments, "right")
-        if low < high and seen.min() - 1 < _WITNESSES:  # One of them is the label itself.
+        if low < high and seen.min() - 1 < _WITNESSES:  # One of the seen labels is the label itself.
             unchecked.append(label)
     return np.array(unchecked, dtype=np.int64)
 
 
 def evidence_against(named: JointState, other: JointState) -> float:
-    """Return the log of the odds for the association of the map `other`, against the association of the map `named`.
+    """Return the log odds of the association of the map `other` over the association of the map `named`.
 
     Both maps are compared at the noise of the odometry that `named` found, which suits `named` best. At the noise of the
-    settings, `named` would lose even if it is right, in a log of a robot with worse odometry: a second object costs less
-    than the error of the path. The noise of boxes and depths shows in each view, whatever the objects are. If `other` found
-    much less of it than `named`, both maps are compared at `_NOISIER` times the noise of `other`. A second box around one
-    thing has no object in `named`, so here it has none in `other`. Each map keeps its own shared errors, which count by
-    their prior.
+    settings, `named` could lose even if it is right. With worse odometry than the settings say, a second object would cost
+    less than the error of the path. The noise of boxes and depths shows in each view, also with wrong objects. If `other`
+    found much less of this noise than `named`, both maps are compared at `_NOISIER` times the noise of `other`. Rays without
+    an object in `named`, such as second boxes around one thing, have none in `other` here. Each map keeps its own shared
+    errors, which count by their prior.
 
-    Args:
-        named: solved, with one object for each label.
-        other: solved, of the same rays.
+    Args: named: a solved map, with one object for each label. other: another solved map of the same rays.
     """
     assert named.errors is not None
     assert other.errors is not None

@@ -1,11 +1,10 @@
-"""Errors that joint mode holds, and that are so large that the map shows them.
+"""Find held errors that are so large that the map shows them. A held error is one that joint mode does not estimate.
 
-With odometry alone, the place and the focal length of a camera are held: they are not estimated, because a path that is free
-to bend fits their usual errors too. So is the difference of two wheels, because a drive without names hardly tells it from
-the bias of a gyroscope. But a gross error bends the path so much that the objects move by many of their sigmas.
-Such an error is estimated after all. A usual error of a focal length stays, and the sigmas contain its effect. A camera that
-somebody turned during the drive cannot be corrected, because no box shows when that was.
-"""
+With odometry alone, the place and the focal length of a camera are held, because a path that is free to bend also fits their
+usual errors. The difference of two wheels is held too. A drive whose labels are no names hardly distinguishes it from the
+bias of a gyroscope. But a gross error bends the path so much that the objects move by many of their sigmas. So a gross error
+is estimated after all. A usual error of a focal length is not estimated, but the sigmas contain its effect. A camera that
+somebody turned during the drive cannot be corrected, because no box shows when somebody turned it."""
 
 from __future__ import annotations
 
@@ -39,28 +38,32 @@ if TYPE_CHECKING:
     from objslam.graph.calibration.next_step import NextStep
 
 _SETTING = {"x": "translation", "y": "translation", "focal": "focal", "turn_per_m": "turn_per_m"}
-"""The setting of each kind of held error. The height of a camera is no held error, because it only lifts the map."""
+"""The setting in `calibration` of each kind of held error. The height of a camera is no held error, because it only lifts
+the map."""
 _USUAL = {"translation": USUAL_PLACE, "focal": USUAL_FOCAL, "turn_per_m": 0.01}
-"""The standard deviation of each held error of usual robots (m, share, rad/m). One wheel of a usual robot is up to 0.3 %
-larger than the other, on a base of 0.3 m. Larger values leave larger errors in the path."""
+"""The standard deviation of each held error of usual robots: of a camera's place (m), of a focal length (a share), and of a
+turn per metre (rad/m). One wheel of a usual robot is up to 0.3 % larger than the other, on a base of 0.3 m. With larger
+values, larger errors stay in the path."""
 _BENDS = "focal"
-"""The setting of the held errors that the covariances contain. In ten recorded drives with focal lengths 4 % too long, 135
-of 150 objects were inside their 95 % ellipsoids without it, and 147 with it. The sigmas of right cameras grow by 1 %. Places
-need no such part: with cameras 0.1 m off, all 45 objects of a recorded drive were inside."""
+"""The setting of the held errors whose usual size the covariances contain. In ten recorded drives with focal lengths 4 % too
+long, 135 of 150 objects were inside their 95 % ellipsoids without this part, and 147 with it. The sigmas of right cameras
+grow by 1 %. Errors of camera places need no such part. With cameras 0.1 m off, all 45 objects of a recorded drive were
+inside."""
 _GROSS = 3.0
-"""A held error is gross beyond this many standard deviations of usual errors. With a smaller number, the path may bend to
-fit a small error that is not there: at 1.5, an image centre that was off by 20 px became a wrong place."""
+"""The number of standard deviations of usual errors beyond which a held error is gross. With a smaller number, the path may
+bend to fit a small error that is not there. At 1.5, an image centre that was off by 20 px became a wrong place of the
+camera."""
 _SUSPECT = 0.6
-"""A solve estimates an error if the predicted error exceeds this share of the limit: the limit of a gross error (`_GROSS`),
-or of a turned camera (`MOVED`). A step from a bent path predicts 65 to 90 % of an error. A smaller share does more solves
-for nothing."""
+"""The share of a limit that a predicted error must exceed, so that a solve estimates the error. The limit is that of a gross
+error (`_GROSS`) or of a turned camera (`MOVED`). One step from a bent path predicts 65 to 90 % of an error. With a smaller
+share, more solves find nothing."""
 _FEWEST = 60
-"""The fewest boxes of each half of a drive that show whether a camera turned between them. Fewer boxes agree by chance."""
+"""The fewest boxes in each half of a drive that show whether a camera was turned. Fewer boxes agree by chance."""
 
 
 @dataclass(frozen=True)
 class Solved:
-    """A solved association, and the keyframes that were solved."""
+    """An association, its estimate, and the keyframes of this solve."""
 
     association: Association
     estimate: Estimate
@@ -68,12 +71,13 @@ class Solved:
 
 
 def with_gross_errors(errors: SharedErrors, solved: Solved) -> tuple[SharedErrors | None, Estimate]:
-    """Return the shared errors with held errors that are gross, to be estimated too, None if no held error is gross.
+    """Return the shared errors with the gross held errors added, so that a solve estimates these too. Return None if none is
+    gross.
 
-    Also return the estimate. If no held error is gross, it has its `moved_by_held`, unless this cannot be computed.
-    errors: the shared errors of the solve, as measured. The settings of the returned errors have the prior of the new
-    errors. A setting that is not `auto` is kept. An error of calibration.file is kept too, because the log is already
-    corrected by it.
+    Also return the estimate. If no held error is gross, the estimate has `moved_by_held`, unless this cannot be computed.
+    The settings of the returned errors have the prior of the new errors. Errors whose setting is not `auto` are not added.
+    Errors in calibration.file are not added either, because the log is already corrected by them. errors: the shared errors
+    of the solve, as measured.
     """
     held, estimate = _held(errors), solved.estimate
     if not held or not _can_tell(errors):
@@ -85,7 +89,7 @@ def with_gross_errors(errors: SharedErrors, solved: Solved) -> tuple[SharedError
         return [name for name in held if name in kinds]
 
     wider = _freed(errors, held)
-    if wider.names == errors.names:  # The poses are those of the camera, which has no errors of its own.
+    if wider.names == errors.names:  # The poses are those of the camera, which then has no errors.
         return None, estimate
     try:
         step = _next_step(wider, solved)
@@ -100,7 +104,7 @@ def with_gross_errors(errors: SharedErrors, solved: Solved) -> tuple[SharedError
 
 
 def with_held_errors(errors: SharedErrors, solution: Solution, ledger: Ledger) -> Solution:
-    """Return the solution with covariances that contain the usual errors of focal lengths that it held.
+    """Return the solution with covariances that contain the usual errors of the focal lengths that its solve held.
 
     errors: the shared errors of the solve, as measured. The ledger gets a warning if these errors cannot be computed.
     """
@@ -120,20 +124,20 @@ def with_held_errors(errors: SharedErrors, solution: Solution, ledger: Ledger) -
 
 
 def _moved_by_held(errors: SharedErrors, solved: Solved, step: NextStep | None = None) -> Floats | None:
-    """Return how far the usual errors of the held focal lengths may move the objects, as `Estimate.moved_by_held`. None if
-    no focal length is held. step: that of more errors, if it is known."""
+    """Return how far the usual errors of the held focal lengths may move the objects, as `Estimate.moved_by_held`. Return
+    None if no focal length is held. step: a known step that also covers other errors, else None."""
     if errors.keyframes.localized_every or _BENDS not in _held(errors) or not _can_tell(errors):
         return None
     wider = _freed(errors, [_BENDS])
     held = np.array([name not in errors.names for name in wider.names])
-    if not held.any():  # The lens of a camera that is its own base has no errors.
+    if not held.any():  # A camera whose poses are those of the robot has no such errors.
         return None
     known = None if step is None else step.only(_like(wider, solved))
     return (_next_step(wider, solved) if known is None else known).moved_by(held)
 
 
 def _held(errors: SharedErrors) -> list[str]:
-    """Return the settings of the errors that a solve held because the log may hardly determine them."""
+    """Return the settings of the errors that a solve held, because the log may hardly determine these errors."""
     of, file = errors.settings.calibration, known_errors(errors.settings)
     told = set(errors.names) if file is None else {*errors.names, *file.names}
     known = {_SETTING.get(kind(name)) for name in told}
@@ -141,7 +145,8 @@ def _held(errors: SharedErrors) -> list[str]:
 
 
 def _freed(errors: SharedErrors, names: list[str]) -> SharedErrors:
-    """Return the errors, with the held errors of these settings added. They are estimated too."""
+    """Return the errors with the held errors of some settings added, so that a solve estimates these too. names: the
+    settings."""
     more = errors.settings.calibration.model_copy(update={name: _USUAL[name] for name in names})
     settings = errors.settings.model_copy(update={"calibration": more})
     other = shared_errors(errors.log, errors.keyframes, errors.rays, settings)
@@ -150,8 +155,9 @@ def _freed(errors: SharedErrors, names: list[str]) -> SharedErrors:
 
 
 def check_turned_camera(errors: SharedErrors, solution: Solution) -> list[Finding]:
-    """Return a finding for each rotation of a camera that differs between the halves of a drive from odometry alone, by the
-    solved map. At a localisation, errors of poses that last look like a turn, and `check_moved_camera` allows for them."""
+    """Return a finding for each camera whose rotation differs between the halves of a drive, as the solved map shows. This
+    is for drives from odometry alone. At a localisation, lasting errors of poses look like a turn, and `check_moved_camera`
+    allows for these errors."""
     if errors.keyframes.localized_every:
         return []
     stamps = errors.keyframes.stamps
@@ -172,7 +178,8 @@ def check_turned_camera(errors: SharedErrors, solution: Solution) -> list[Findin
 
 
 def _halves(errors: SharedErrors, late: Bools) -> SharedErrors:
-    """Return the errors with a camera of its own for each half of the drive. late: (K,) the keyframes of the second half."""
+    """Return the errors of a drive whose halves count as having different cameras. late: (K,) whether a keyframe is in the
+    second half."""
     keyframes = replace(errors.keyframes, camera=errors.keyframes.camera + len(errors.log.cameras) * late)
     log = replace(errors.log, cameras=in_halves(errors.log.cameras))
     found = shared_errors(log, keyframes, errors.rays, errors.settings)
@@ -183,8 +190,8 @@ def _halves(errors: SharedErrors, late: Bools) -> SharedErrors:
 
 
 def _can_tell(errors: SharedErrors) -> bool:
-    """Return whether the solve can show held errors: it estimates shared errors, and no ray is to a fiducial with corners,
-    because corners are landmarks of their own."""
+    """Return whether the solve can show held errors. It must estimate shared errors. No ray may be to a fiducial with
+    corners, because a solve treats corners as landmarks."""
     return bool(errors.names) and errors.rays.corner_sigma is None
 
 

@@ -27,20 +27,20 @@ if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
 
 _SOLVED_XY, _SOLVED_YAW = 0.02, 0.005
-"""The noise (m, rad) of solved poses that an association expects. Larger values let it tolerate larger residuals."""
+"""The noise (m, rad) of solved poses that an association expects. With larger values, it tolerates larger residuals."""
 _FIRST = 2.0
-"""The factor on `_SOLVED_XY` and `_SOLVED_YAW` before the first solve, and on a path from a grid. A larger factor tolerates
-larger residuals."""
+"""The factor on `_SOLVED_XY` and `_SOLVED_YAW` before the first solve, and on a path from a grid. With a larger factor, an
+association tolerates larger residuals."""
 _RUINED = 200.0
-"""If the log odds of the best round over the last round are at least this, the best round counts, not the last. A merge that
-is right may first cost 80, and ruined maps cost 500 to 5000. With a larger value, a worse map may stay."""
+"""The least log odds of the best round over the last round at which the best round is taken instead. A right merge may first
+cost 80, and ruined maps cost 500 to 5000. With a larger value, a worse map may stay."""
 Guess = tuple[Association, Floats]
 """An association of the rays, and the positions (N, 3) m of its objects."""
 
 
 @dataclass
 class Effort:
-    """How many solves a search has taken. All its attempts share one."""
+    """The number of solves that a search has taken. All attempts of a search share one `Effort`."""
 
     solves: int = 0
 
@@ -49,13 +49,13 @@ class Effort:
 class JointState:
     """The present state of the rounds of a joint solve.
 
-    frames, all_rays: all keyframes with a pose, also without rays, as measured. keyframes, rays: the keyframes that have a
-    ray, and their rays, corrected by the present shared errors. errors: the shared errors of `keyframes` and `rays`. theta:
-    (P,) their last values, None before the first solve. hold: whether the shared errors are known well enough to stay fixed
-    until the last solve. unsettled, unfinished: as in `Solution`. effort: of the search that the state is a part of.
-    doubted: the labels that may name one object or several. names: the objects of labels that are known to be names. The
-    rounds of association leave these objects their rays, and look for objects of the other labels only. at_poses: the
-    association of a map at the given poses, if there is one.
+    frames, all_rays: all keyframes with a pose and all rays, as measured. keyframes, rays: the keyframes that have a ray,
+    and their rays, corrected by the present shared errors. errors: the shared errors of `keyframes` and `rays`. theta: (P,)
+    their last values, None before the first solve. hold: whether the shared errors stay fixed until the last solve, because
+    they are known well enough. unsettled, unfinished: as in `Solution`. effort: the effort of the search that this state
+    belongs to. doubted: the labels that may name one object or several. names: the objects of labels that are known to be
+    names. The rounds of association do not change the rays of such objects. at_poses: the association of a map at the given
+    poses, if any.
     """
 
     frames: Keyframes
@@ -88,7 +88,7 @@ class JointState:
         trace: Trace | None = None,
         begin: Floats | None = None,
     ) -> Estimate:
-        """Solve an association. start: (K, 4, 4) map_T_camera. begin: (P,) the first shared errors, else theta."""
+        """Solve an association. start: (K, 4, 4) first map_T_camera. begin: (P,) first shared errors, None for theta."""
         from objslam.graph import batch_solver
 
         self.effort.solves += 1
@@ -97,7 +97,7 @@ class JointState:
         return batch_solver.solve_joint(*given, start, trace, errors, at, self.hold)
 
     def solve(self, why: Why, association: Association, start: Floats | None = None) -> Self:
-        """Return the state after the solve of an association. start: (K, 4, 4) map_T_camera."""
+        """Return the state after the solve of an association. start: (K, 4, 4) first map_T_camera."""
         solved = self.solve_once(association, self.errors, start, self.trace)
         if self.trace is not None:
             self.trace.end_round(why, association, solved)
@@ -128,8 +128,8 @@ class JointState:
     def merged(self, bundles: bool = False) -> Self:
         """Return the state after objects that appear twice were merged and solved again.
 
-        bundles: whether objects may be bundles of rays to one thing from different sides. The boxes of each side have an
-        error of their own (`box_offsets`), so such bundles lie farther apart than their covariances say.
+        bundles: whether two objects may be bundles of rays to one thing from different sides. The boxes of each side have a
+        different error (`box_offsets`), so such bundles lie farther apart than their covariances say.
         """
         state = self
         for _ in range(self.settings.joint.max_rounds):
@@ -146,9 +146,9 @@ class JointState:
     def alternated(self, map_T_base: Floats, guess: Guess | None) -> Self:
         """Return the state after association and solve in turns. map_T_base: (K, 4, 4) the first poses.
 
-        If an earlier association returns, a few rays could change for ever. Then the best `explained` state since then is
-        returned. A few changed rays hardly change the shared errors, but their estimation takes most of the time of a solve.
-        So the shared errors keep the values of the first round. After the last round, they are estimated again.
+        If an earlier association returns, a few rays could change for ever. Then the best `explained` state since that round
+        is returned. A few changed rays hardly change the shared errors, but to estimate these takes most of the time of a
+        solve. So the shared errors keep the values of the first round. After the last round, they are estimated again.
         """
         state, before, earlier, states = self, self, dict[bytes, Self](), [] if self.estimate is None else [self]
         held = False  # Whether the last solve held the shared errors.
@@ -181,9 +181,9 @@ class JointState:
         return replace(state, hold=self.hold, unsettled=unsettled)._or_if_ruined(states)
 
     def _or_if_ruined(self, states: Sequence[Self]) -> Self:
-        """Return the state after rounds, or the best of the states before if it explains the log far better.
+        """Return this state, or the best of some earlier states if it explains the log far better (`_RUINED`).
 
-        A wrong merge can ruin a map in the last round, and so can noise that is estimated from half of the rays."""
+        In the last round, a wrong merge can ruin a map. So can noise that is estimated from half of the rays."""
         best = max(states, key=lambda one: one.explained, default=self)
         if best.association is None or best.explained - self.explained < _RUINED:
             return self
@@ -201,8 +201,8 @@ class JointState:
         return objects_changed((before.association, before.estimate), (self.association, self.estimate))
 
     def released(self, hold: bool) -> Self:
-        """Return the state after one more solve. hold: whether the shared errors keep their values. If not, the solve
-        estimates them again."""
+        """Return the state after one more solve. hold: whether the solve keeps the shared errors. If not, it estimates
+        them."""
         assert self.association is not None
         state = replace(self, hold=hold)
         return state.solve("association", self.association, self.solved_poses).merged()
@@ -216,11 +216,12 @@ class JointState:
         return replace(chosen, rounds=self.rounds, unsettled=0)
 
     def split(self) -> Self:
-        """Split the objects that may be two. Return the new state if it is `better`, else this one.
+        """Return the state after splits of the objects that may be two things, if it is `better`. Otherwise return this
+        state.
 
         The rounds of `alternated` do not separate two things that share one object, because the path is bent until all rays
-        agree. They also keep a phantom where the rays of two things cross. Here all objects whose rays come in two bundles
-        are split at once. The solve takes the bend out of the path, and bundles of one thing are merged again.
+        agree. They also keep a phantom where the rays of two things cross. So this method splits all objects whose rays come
+        in two bundles at once. A solve takes the bend out of the path. Then bundles of one thing are merged again.
         """
         assert self.association is not None
         _, direction = self.rays.in_map(self.solved_poses)
@@ -239,8 +240,8 @@ class JointState:
         return self if self._has_rays_of(attempt) else self.better(attempt)
 
     def _with_box_offsets(self) -> Estimate:
-        """Return the estimate with the errors that boxes share added to its covariances, as large as the settings say. Rays
-        from one side do not show them."""
+        """Return the estimate with the errors that boxes share added to its covariances. Their size is that of the settings,
+        because rays from one side do not show it."""
         from objslam.mapping.box_offsets import with_box_offsets
 
         assert self.association is not None
@@ -260,16 +261,16 @@ class JointState:
         return replace(self, ledger=Ledger(), trace=None if self.trace is None else self.trace.aside())
 
     def better(self, attempt: Self) -> Self:
-        """Return the result of an attempt if its association explains more than the association of this state. Otherwise
-        return this state."""
+        """Return the result of an attempt if its association explains more than that of this state. Otherwise return this
+        state."""
         return self.replaced(attempt) if self.gain(attempt) > 0 else self
 
     def gain(self, attempt: Self) -> float:
-        """Return how much more the association of an attempt explains than the association of this state (log odds).
+        """Return the log odds of the association of an attempt over the association of this state.
 
-        Each association counts at the shared errors and the noise of the state at which it explains more. The noise that a
-        wrong map estimates may be far from that at which it explains most. The sum of the gains at both states would be too
-        kind to an attempt with much noise: at this noise, a good map explains little more than a bad one.
+        Each association is judged at the errors and the noise of both states, and the larger value counts. The noise that a
+        wrong map estimates may be far from the noise at which it explains most. The sum of the gains at both states would
+        favour an attempt with much noise. At such noise, a good map explains little more than a bad map.
         """
         mine = max(self.explained, self._explained_like(attempt))
         return max(attempt.explained, attempt._explained_like(self)) - mine
@@ -282,7 +283,7 @@ class JointState:
         return replace(attempt, ledger=self.ledger, trace=self.trace)
 
     def _explained_like(self, other: Self) -> float:
-        """Return what the association explains at the shared errors and the noise of another state."""
+        """Return `explained` of this association at the shared errors and the noise of another state."""
         if self.errors is None or other.errors is None or other.theta is None:
             return self.explained
         assert self.association is not None
@@ -292,7 +293,7 @@ class JointState:
 
     @property
     def agree(self) -> Bools:
-        """(R,) whether a ray agrees with its object."""
+        """A mask (R,) of the rays that agree with their object."""
         assert self.association is not None
         assert self.estimate is not None
         return np.asarray((self.estimate.weight > 0) & (self.association.object >= 0))
@@ -304,7 +305,7 @@ class JointState:
         return self.estimate.log_evidence
 
     def every_frame(self, map_T_base: Floats) -> tuple[Keyframes, Rays, Floats]:
-        """Return all keyframes (F of them), also without rays, all rays, and map_T_camera (F, 4, 4) of the keyframes.
+        """Return all F keyframes with a pose, all rays, and map_T_camera (F, 4, 4) of the keyframes.
 
         Keyframes and rays are corrected by the present shared errors. map_T_base: (K, 4, 4) of the keyframes that have a
         ray."""
@@ -319,8 +320,8 @@ class JointState:
         return frames, rays, at @ frames.base_T_camera
 
     def associated(self, map_T_base: Floats, guess: Guess | None, *, rough: bool) -> Association:
-        """Return an association of the rays at poses map_T_base (K, 4, 4). guess: it begins there. rough: whether the poses
-        are not those of a solve, so that residuals are larger."""
+        """Return an association of the rays at poses map_T_base (K, 4, 4). guess: where the search begins. rough: whether
+        the poses are not from a solve, so that residuals are larger."""
         from objslam.association.global_association import associate_globally
         from objslam.association.observations import PosedRays
         from objslam.graph.fixed_pose_triangulation import noise_of_poses, noise_up

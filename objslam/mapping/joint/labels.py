@@ -1,4 +1,4 @@
-"""Judge whether each label names a single object. Then the labels alone decide which rays belong together."""
+"""Judge whether each label names a single object. If so, the labels alone decide which rays belong together."""
 
 from __future__ import annotations
 
@@ -25,40 +25,41 @@ if TYPE_CHECKING:
     from objslam.mapping.solution import Solution
 
 MANY, SECOND = 5, 0.25
-"""A label has a second object if at least `MANY` of its rays, and more than the share `SECOND`, are rejected. Larger values
-find fewer second objects."""
+"""The least number and the share of a label's rays that must be rejected, so that the label has a second object. With larger
+values, fewer second objects are found."""
 _DOUBLE = 0.1
-"""One object for each label is tried if at most this share of the pairs of a label and a keyframe has several boxes. A
+"""The largest share of pairs of a label and a keyframe with several boxes, at which one object for each label is tried. A
 detector draws some boxes twice, and some false ones. With a larger share, more logs are tried without success. Each try
 takes a solve."""
 _AGREES = 3.0
-"""A ray agrees with the object of its label if it is off by at most this many standard deviations. With a larger value,
-fewer boxes can show a second object."""
+"""The largest miss, in standard deviations, of a ray that agrees with the object of its label. With a larger value, fewer
+boxes can show a second object."""
 OTHERS = 3
-"""The fewest objects with `MANY` rays whose usual noise judges the label of each one. With a larger number, fewer logs are
-judged."""
+"""The fewest objects with `MANY` rays that show the usual noise, by which each label is judged. With a larger number, fewer
+logs are judged."""
 _JUDGEMENTS = 2
-"""How many times `noise_explains` solves, each time with the noise that the last solve found. A solve that rejects rays
+"""The number of solves in `noise_explains`. Each begins with the noise that the last solve found. A solve that rejects rays
 finds too little noise, so a second solve finds more. A larger number is slower."""
 _SAME_NOISE = 0.1
-"""`noise_explains` does not solve again if the noise changes by less than this share. A larger value ends sooner."""
+"""The share by which the noise must change, so that `noise_explains` solves again. With a larger value, it ends sooner."""
 
 _CLOCKS = (-1.0, 1.0, -2.0, 2.0)
 """The clock offsets that `clock_explains` tries, in standard deviations of their prior. A solve converges from one standard
-deviation away, so a denser grid is slower and finds nothing new. A wider grid finds clocks that the prior excludes."""
+deviation away, so closer values would take time and find nothing new. Larger values find clocks that the prior excludes."""
 _SHORT = 500
-"""`clock_explains` tries clock offsets for logs with at most this number of keyframes. A longer log has enough rays to find
-its clock in one solve. A larger number is slower."""
+"""The most keyframes of a log for which `clock_explains` tries clock offsets. A longer log has enough rays to find its clock
+in one solve. A larger number is slower."""
 
 _LARGER = 1.5
-"""`warn_of_noise` names a kind of noise if the log shows more than this multiple of its noise in the settings. A larger
-multiple names fewer kinds."""
+"""The multiple of the noise in the settings above which `warn_of_noise` names a kind of noise. With a larger multiple, fewer
+kinds are named."""
 
 
 def may_be_by_label(settings: Settings, rays: Rays) -> bool:
     """Return whether to try one object for each label.
 
-    association.method decides. `by_label` means yes. `auto` means yes if hardly any keyframe has two rays of one label.
+    association.method decides. `by_label` means yes. `auto` means yes if hardly any keyframe has several rays of one label.
+    Any other method means no.
     """
     if settings.association.method != "auto":
         return settings.association.method == "by_label"
@@ -67,7 +68,7 @@ def may_be_by_label(settings: Settings, rays: Rays) -> bool:
 
 
 def angles_to_objects(rays: Rays, estimate: Estimate, map_T_camera: Floats) -> Floats:
-    """Return the angle (R,), rad, between each ray and the object of its label, NaN if the object has no position.
+    """Return the angle (R,) in rad between each ray and the object of its label. It is NaN if the object has no position.
 
     estimate: with one object for each label. map_T_camera: (K, 4, 4) the solved poses.
     """
@@ -78,11 +79,11 @@ def angles_to_objects(rays: Rays, estimate: Estimate, map_T_camera: Floats) -> F
 def shows_second_object(
     rays: Rays, association: Association, estimate: Estimate, keyframes: Keyframes, map_T_camera: Floats, settings: Settings
 ) -> bool:
-    """Return whether a label has a second object: rays without an object meet in one point, more closely than by chance.
+    """Return whether a label has a second object, because rays without an object meet in one point.
 
-    Three kinds of rays do not count. The first agree with the object of their label. The second have a box around that
-    object, which has another box in the same keyframe. The third have a wrong name (`_misnamed`). keyframes: of the rays.
-    map_T_camera: (K, 4, 4) the solved poses.
+    Three kinds of rays do not count: rays that agree with the object of their label, rays of a second box around that object
+    (`_drawn_twice`), and rays of boxes with a wrong name (`_misnamed`). keyframes: of the rays. map_T_camera: (K, 4, 4) the
+    solved poses.
     """
     from objslam.graph.fixed_pose_triangulation import triangulate_at
 
@@ -95,8 +96,8 @@ def shows_second_object(
 
 
 def _drawn_twice(rays: Rays, association: Association) -> Bools:
-    """Return which rays (R,) have a second box around the object of their label. Its first box is in the same keyframe, and
-    the centre of one of the two boxes is inside the other box."""
+    """Return a mask (R,) of the rays whose box and another box of the same keyframe are around one object. The other box
+    belongs to the object of their label. The centre of one of the two boxes is inside the other box."""
     held = np.flatnonzero(association.object >= 0)
     key = rays.keyframe * len(rays.label_names) + rays.label
     order = held[np.argsort(key[held], kind="stable")]
@@ -106,10 +107,11 @@ def _drawn_twice(rays: Rays, association: Association) -> Bools:
 
 
 def _misnamed(rays: Rays, association: Association, estimate: Estimate, map_T_camera: Floats) -> Bools:
-    """Return which rays (R,) without an object agree with the object of another label, which has no box in their keyframe.
+    """Return a mask (R,) of the rays without an object that agree with the object of another label. This object has no box
+    in the keyframe of the ray.
 
-    A detector sometimes gives a box a wrong name. Then the object misses a box, and the label has one too many. Several of
-    these boxes may be of one object, so their rays meet there.
+    A detector sometimes gives a box a wrong name. Then the object lacks a box, and the wrong label has one box too many.
+    Several such boxes may be of one object, so their rays meet in one point.
     """
     asked = np.flatnonzero(association.object < 0)
     origins, directions = rays.in_map(map_T_camera)
@@ -124,20 +126,21 @@ def _misnamed(rays: Rays, association: Association, estimate: Estimate, map_T_ca
 
 
 def _contains(boxes: Floats, others: Floats) -> Bools:
-    """Return whether boxes (R, 4) contain the centres of other boxes (R, 4)."""
+    """Return whether each box (R, 4) contains the centre of the other box (R, 4) in the same row."""
     centre = (others[:, :2] + others[:, 2:]) / 2
     return np.asarray(((boxes[:, :2] <= centre) & (centre <= boxes[:, 2:])).all(axis=1))
 
 
 def labels_tell(association: Association, estimate: Estimate) -> bool:
-    """Return whether every label is one object: no label is `rejected`. False if no object has a position."""
+    """Return whether every label is one object, because no label is `rejected`. The result is False if no object has a
+    position."""
     return bool(np.isfinite(estimate.positions[:, 0]).any()) and not rejected(association, estimate).any()
 
 
 def rejected(association: Association, estimate: Estimate) -> Bools:
-    """Return the objects (N,) with many rejected rays (`MANY`).
+    """Return a mask (N,) of the objects with many rejected rays (`MANY`, `SECOND`).
 
-    An object without a position is ignored, because its rays may only have too little parallax.
+    An object without a position does not count, because its rays may only have too little parallax.
     """
     held = association.object >= 0
     number = np.bincount(association.object[held], minlength=association.count)
@@ -147,12 +150,13 @@ def rejected(association: Association, estimate: Estimate) -> Bools:
 
 
 def scatter_alone(named: JointState | Solution) -> Bools:
-    """Return the objects (N,) with which their rays agree only at noise that the rays of other labels do not have.
+    """Return a mask (N,) of the objects whose rays agree only at noise that the rays of other labels do not have.
 
-    A person who walks has a label, but no place. A solve explains such rays by noisy boxes. Then hardly a ray is rejected,
-    and only the other labels show how noisy the boxes are. A label scatters alone if at least `MANY` of its rays, and more
-    than the share `SECOND`, are off by more than `_AGREES` times the usual noise of an object. The noise of the settings
-    counts if it is larger. named: a map with one object for each label, whose rays have sigmas by its own noise.
+    A person who walks has a label, but no fixed place. A solve explains the rays to this person by noisy boxes. Then hardly
+    any ray is rejected, and only the other labels show how noisy the boxes are. A label scatters alone if at least `MANY` of
+    its rays, and more than the share `SECOND`, are off by more than `_AGREES` times the usual noise of an object. The noise
+    of the settings counts if it is larger. named: a map with one object for each label. The sigmas of its rays contain the
+    noise that its solve found.
     """
     association, estimate = named.association, named.estimate
     assert association is not None
@@ -162,10 +166,11 @@ def scatter_alone(named: JointState | Solution) -> Bools:
 
 
 def known_names(solved: JointState) -> Association | None:
-    """Return the objects of the labels of a map with one object for each of its labels, with the nearest box in each frame.
+    """Return the association of the labels that are known to be names, with the nearest box of each label in each frame.
 
-    A label needs `MANY` rays that agree. With fewer, a misread box among them would hardly be noticed. None if other boxes
-    show a second object of any label. solved: the map. The log may have more labels.
+    A label needs `MANY` rays that agree. With fewer, a box with a wrong name would hardly be noticed. Return None if other
+    boxes show a second object of any label. solved: a map with one object for each of its labels. The log may have more
+    labels.
     """
     before = solved.association
     assert before is not None
@@ -184,11 +189,13 @@ def known_names(solved: JointState) -> Association | None:
 
 
 def rays_beyond(named: JointState | Solution, association: Association, positions: Floats) -> tuple[Ints, Ints]:
-    """Return how many rays of each object (N,) are off by more than `_AGREES` times the usual noise, and of how many rays.
+    """Return two numbers (N,) for each object: its rays that are off by more than `_AGREES` times the usual noise, and all
+    its rays.
 
-    The usual noise is the one of the objects whose labels are in the map `named`. Both numbers are zero for objects with
-    fewer than `MANY` rays, and for all objects if fewer than `OTHERS` show the usual noise. association: of the rays of the
-    map, with its labels or more. positions: (N, 3) m of the objects at the path of the map, NaN if unknown.
+    The usual noise is that of the objects whose labels are in the map `named`. Both numbers are zero for objects with fewer
+    than `MANY` rays. Both are zero for all objects if fewer than `OTHERS` objects show the usual noise. association: the
+    object of each ray of the map. It may have more labels than the map. positions: (N, 3) m, of the objects at the path of
+    the map, NaN if unknown.
     """
     assert named.association is not None
     assert named.estimate is not None
@@ -208,10 +215,11 @@ def rays_beyond(named: JointState | Solution, association: Association, position
 
 
 def clock_explains(association: Association, errors: SharedErrors, solve: Callable[[Floats], Estimate]) -> Floats | None:
-    """Return shared errors (P,) from which a solve finds one object for each label. None if there are none.
+    """Return shared errors (P,) from which a solve finds one object for each label. Return None if no tried clock leads to
+    this.
 
     A solve that starts with a wrong clock offset rejects true rays. In a short log, too few rays are left to find the clock.
-    So the solve is tried from each clock offset in `_CLOCKS`. solve: solves once, from the given shared errors (P,).
+    So the solve is tried from each clock offset in `_CLOCKS`. solve: a function that solves once, from shared errors (P,).
     """
     clocks = np.array([kind(name) == "clock" for name in errors.names], dtype=bool)
     if not clocks.any() or len(errors.keyframes) > _SHORT:
@@ -227,13 +235,13 @@ def clock_explains(association: Association, errors: SharedErrors, solve: Callab
 def noise_explains(
     association: Association, estimate: Estimate, errors: SharedErrors, solve: Callable[[SharedErrors], Estimate]
 ) -> Estimate | None:
-    """Return an estimate with larger noise in which each label is one object. None if larger noise does not help.
+    """Return an estimate with larger noise in which each label is one object. Return None if larger noise does not help.
 
     With too little noise in the settings, poses cannot move far enough. Then the rays of one object look like rays of
     several. So the noise is estimated, even if the settings fix it, and the labels are judged again.
 
-    estimate: a solution in which some label has many rejected rays. errors: the shared errors of the log. solve: solves
-    once.
+    estimate: a solution in which some label has many rejected rays. errors: the shared errors of the log. solve: a function
+    that solves once, with shared errors.
     """
     errors = errors.with_unknown_noise()
     before = NOMINAL if estimate.noise is None else estimate.noise
@@ -249,7 +257,7 @@ def noise_explains(
 
 
 def warn_of_noise(errors: SharedErrors, estimate: Estimate, ledger: Ledger) -> None:
-    """Warn if the settings fix the noise, and `estimate` found more. In `estimate`, each label is one object."""
+    """Warn if the settings fix noise of which `estimate` found more. In `estimate`, each label is one object."""
     said = errors.with_unknown_noise().unknown_noise - errors.unknown_noise
     if estimate.noise is None or not said:
         return

@@ -1,4 +1,5 @@
-"""Merge objects that are in the map twice, and split objects that may be two. Drift between two visits causes both."""
+"""Merge objects that are in the map twice, and split objects that may be two things. Drift between two visits causes
+both."""
 
 from __future__ import annotations
 
@@ -18,17 +19,18 @@ if TYPE_CHECKING:
 
 _GAP = np.radians(15.0)
 """The least gap (rad) between the directions of two bundles of rays. A robot that drives past a thing sees it from all
-directions between the first and the last, apart from missed boxes. With a smaller gap, more objects are tried as two, which
-takes time."""
+directions between the first and the last, apart from missed boxes. With a smaller gap, more objects are split on trial,
+which takes time."""
 
 
 def merge_unseen_together(rays: Rays, association: Association, estimate: Estimate, farthest: float) -> Association:
-    """Merge pairs of objects of one label whose positions agree within their covariances, and that share no frame.
+    """Return the association with pairs of objects merged that have one label, agree within their covariances, and share no
+    frame.
 
-    Each of the two copies fits the drifted poses of its visit, so a new association at these poses keeps both. The merge
-    closes the loop. The nearest pairs by Mahalanobis distance merge first. An object merges at most once in one call. A pair
-    whose boxes look alike may lie further apart, and a pair whose boxes differ must lie nearer. farthest: the largest
-    distance (m) of a pair.
+    Two copies of a thing each fit the drifted poses of their visit, so a new association at these poses keeps both. The
+    merge closes the loop. The nearest pairs by Mahalanobis distance merge first. An object merges at most once in one call.
+    A few shared frames are allowed (`seen_as_two`). A pair whose boxes look alike may lie further apart. A pair whose boxes
+    differ must lie nearer. farthest: the largest distance (m) of a pair.
     """
     position, covariance = estimate.positions, estimate.covariance
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]) & np.isfinite(position[:, 0]))
@@ -70,16 +72,15 @@ def joined(association: Association, into: Ints) -> Association:
 
 
 def split_at_gaps(direction: Floats, association: Association, used: Bools, fewest: int) -> Association:
-    """Split objects whose rays come in two bundles: there is a wide gap between the directions of the rays.
+    """Return the association with objects split whose rays come in two bundles. A wide gap lies between the directions of
+    the bundles.
 
-    The bundles may be two things, such as the signs on both sides of a wall. If a path is bent to bring them together, all
-    their rays agree with one point.
+    The bundles may be two things, such as the signs on both sides of a wall. If the path is bent to bring the two things
+    together, all rays of both agree with one point.
 
-    Args:
-        direction: (R, 3) unit, of the rays in map.
-        association: of the rays. The second bundle of an object becomes a new object of the same label.
-        used: (R,) the rays that agree with their objects. The others go with the bundle on their side of the gap.
-        fewest: the fewest used rays of a bundle.
+    Args: direction: (R, 3) unit, of the rays in map. association: the association of the rays. The second bundle of an
+    object becomes a new object of the same label. used: (R,) whether each ray agrees with its object. The other rays go with
+    the bundle on their side of the gap. fewest: the fewest used rays of a bundle.
 
     A new object has the labels and the existence of the object that was split.
     """

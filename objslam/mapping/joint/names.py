@@ -1,8 +1,7 @@
-"""Labels that are known to be names, beside labels whose objects are searched for.
+"""Join the objects of labels that are known to be names with objects of other labels that a search found.
 
-Rounds of association judge each object by itself, at solved poses whose errors they know only roughly. They may give up a
-thing that is seldom seen, or that stands close to others, though its label tells which boxes it has.
-"""
+Rounds of association judge each object by itself, at solved poses whose errors are known only roughly. The rounds may give
+up a thing that is seldom seen, or that stands close to others, although its label shows which boxes it has."""
 
 from __future__ import annotations
 
@@ -18,8 +17,8 @@ if TYPE_CHECKING:
 def beside_names(names: Association, found: Association, rays: Rays) -> Association:
     """Return the objects of `names`, followed by those objects of other labels that a search among all rays found.
 
-    The search must know of the things with names too: from them it learns how often a thing is detected. The objects of
-    names have no probability of existence, because their labels tell that they exist. rays: (R,) of both associations.
+    The search must also include the rays of names, because it learns from them how often a thing is detected. The objects of
+    names have no probability of existence, because their labels show that they exist. rays: the R rays of both associations.
     """
     other = ~np.isin(found.label, names.label)
     number = np.append(np.where(other, names.count + np.cumsum(other) - 1, -1), -1)

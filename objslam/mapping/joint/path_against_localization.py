@@ -1,9 +1,8 @@
-"""Compare the path of a joint solve with the localisation of the log.
+"""Compare the path of a joint solve with the localisation of the log, to find a bent path.
 
-Boxes of which only slices are seen can bend a path. The noise of the localisation is estimated from the same boxes, so it
-grows with the bend, and the residuals look usual. The odometry knows no boxes. So the localisation's own noise is taken from
-the odometry here, and the distance of the path is judged by that noise.
-"""
+Things of which the boxes show only slices can bend a path. The noise of the localisation is estimated from the same boxes,
+so it grows with the bend, and the residuals look usual. The odometry does not depend on boxes. So this module takes the
+noise of the localisation from a comparison with the odometry, and judges the distance of the path by this noise."""
 
 import numpy as np
 
@@ -17,26 +16,27 @@ from objslam.mapping.checks.finding import Finding
 from objslam.mapping.solution import Solution
 
 BENT_PATH = "path off the localisation"
-"""The name of the finding."""
+"""The name of the finding that the solved path is bent."""
 _SECONDS = 5.0
-"""The length (s) of a piece of the path over which its distance from the localisation is smoothed. Clocks and single jumps
-disturb shorter pieces. A longer piece misses shorter bends."""
+"""The length (s) of a piece of the path. Each piece is judged by its median distance from the localisation. Clocks and
+single jumps disturb shorter pieces. Longer pieces miss short bends."""
 _FEWEST = 3
-"""The fewest localised poses of a piece. The median of fewer follows a single jump. With a larger number, fewer pieces are
-judged."""
+"""The fewest localised poses of a piece that is judged. With fewer poses, the median follows a single jump. With a larger
+number, fewer pieces are judged."""
 _CHANCE = 1e-3
 """The probability that a right path gets a finding by chance, over all its pieces together. With a larger value, smaller
-bends are found, and more right paths are named."""
+bends are found, but more right paths get a finding."""
 _OF_MEDIAN = np.pi / 2
-"""The variance of the median of many values with normal white noise, as a multiple of that of their mean."""
+"""The variance of the median of many values with normal white noise, as a multiple of the variance of their mean."""
 
 
 def check_bent_path(solution: Solution, errors: SharedErrors | None, settings: Settings) -> Finding | None:
     """Return a finding if the solved path lies further from the localisation for seconds than the localisation errs.
 
-    The places of each piece are compared by their median. Its squared distance over its variance has a chi-square
-    distribution with two degrees of freedom, and all pieces share one chance of a false alarm. A right path follows a part
-    of the localisation's errors, so its distances are smaller than that. errors: of all frames, before the solve.
+    The test of a piece is on the median of its distances. The square of this median over its variance has a chi-square
+    distribution with two degrees of freedom. All pieces share one probability of a false alarm. A right path follows a part
+    of the localisation's errors, so its distances are even smaller. errors: the shared errors with all frames, before the
+    solve.
     """
     from objslam.graph.factors.localization import localized  # It imports gtsam.
 
@@ -51,7 +51,7 @@ def check_bent_path(solution: Solution, errors: SharedErrors | None, settings: S
     stamps, off, carried = stamps[order], off[order], carried[order]
     sigmas, limit = sigmas_of_pieces(stamps, off, carried, said, WHITE)
     if not (sigmas > limit).any():
-        return None  # More noise would only make it smaller.
+        return None  # More noise would only make these numbers smaller.
     noise = _own_noise(solution, errors)
     own = said * max(noise.place, 1.0)
     sigmas, limit = sigmas_of_pieces(stamps, off, carried, own, noise.lasting[1])
@@ -71,11 +71,12 @@ def check_bent_path(solution: Solution, errors: SharedErrors | None, settings: S
 
 
 def sigmas_of_pieces(stamps: Floats, off: Floats, carried: Floats, sigma: float, lasting: Lasting) -> tuple[Floats, float]:
-    """Return how far each piece lies from the localisation, in standard deviations, and how far chance allows.
+    """Return the distance of each piece from the localisation, in standard deviations, and the largest distance that is
+    likely by chance.
 
-    stamps: (n,) s, increasing. off: (n, 2) m, of the path from the localisation. carried: (n,) m^2, variances of further
-    white errors. sigma: m, of the localisation, and lasting: its lasting part. The first value is NaN for a piece with too
-    few poses.
+    stamps: (n,) s, increasing. off: (n, 2) m, from the localisation to the path. carried: (n,) m^2, the variances of further
+    white errors. sigma: m, the noise of the localisation. lasting: the part of this noise that lasts. The distance is NaN
+    for a piece with too few poses.
     """
     piece = _pieces(stamps)
     sigmas = np.full(piece.max(initial=-1) + 1, np.nan)
@@ -92,13 +93,14 @@ def sigmas_of_pieces(stamps: Floats, off: Floats, carried: Floats, sigma: float,
 
 
 def _pieces(stamps: Floats) -> Ints:
-    """Return the piece (n,) of each pose. Pieces without a pose have no number, so a jump of the stamps costs nothing."""
+    """Return the number (n,) of each pose's piece. Pieces without a pose get no number, so a jump of the stamps takes no
+    time."""
     return np.unique((stamps - stamps[:1]) // _SECONDS, return_inverse=True)[1]
 
 
 def _own_noise(solution: Solution, errors: SharedErrors | None) -> NoiseFactors:
-    """Return the noise of the localisation that the odometry shows. Without odometry, only the boxes tell it, so a bend
-    that lasts is hidden in it."""
+    """Return the noise of the localisation that the odometry shows. Without odometry, this is the noise that the solve found
+    from the boxes, which hides a bend that lasts."""
     if errors is None or "localization" not in errors.unknown_noise:
         return NoiseFactors()
     if errors.keyframes.odom_T_base is None:

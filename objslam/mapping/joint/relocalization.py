@@ -22,20 +22,20 @@ if TYPE_CHECKING:
     from objslam.mapping.joint.joint_alternation import JointState
 
 _STILL = 0.01
-"""The rounds along the most likely path stop when at most this share of the rays changes its object. A larger share stops
-them sooner. The share is not zero, because the path is rounded to a grid, so that a few rays change in every round."""
+"""The largest share of rays that change their object in the last round along the most likely path. With a larger share, the
+rounds end sooner. The share is not zero, because the path is rounded to a grid, so a few rays change in every round."""
 _WORSE = 2
-"""The rounds along the most likely path end after this number of consecutive rounds without improvement. A larger number
-takes longer, but gets over more rounds in which close objects merge."""
+"""The number of consecutive rounds without improvement after which the rounds along the most likely path end. A larger
+number takes longer, but gets over more rounds in which close objects merge."""
 
 
 def relocalized(begin: JointState) -> JointState:
-    """Do rounds along the most likely path through the map. Return the new state if it is `better`, else the given one,
-    which is also returned if the search has taken all its solves.
+    """Return the state after rounds along the most likely path through the map, if this state is `better`. Otherwise return
+    the given state. It is also returned if the search has taken all its solves.
 
     The rounds of `JointState.alternated` keep a path that is bent onto wrong landmarks, because all its rays agree. So each
-    round here begins with another path. It is the most likely one if any ray may belong to any landmark. Every second round
-    holds the shared errors and the noise, because one round changes them little.
+    round here begins with another path. This is the most likely path if any ray may belong to any landmark. Every second
+    round holds the shared errors and the noise, because one round changes them little.
     """
     if begin.keyframes.odom_T_base is None or begin.keyframes.localized_every or begin.spent:
         return begin
@@ -82,7 +82,7 @@ def relocalize(
 ) -> tuple[Floats, Association] | None:
     """Return the most likely path (K, 4, 4) map_T_base through a map, and the objects of the rays along it.
 
-    Objects do not change, but may lose all their rays. None if no label has two objects that could be confused.
+    The objects stay the same, but may lose all their rays. Return None if no label has two objects that could be confused.
     """
     position = estimate.positions
     if not len(position):

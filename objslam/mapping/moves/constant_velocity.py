@@ -1,4 +1,4 @@
-"""Points at rest, and points with a constant velocity, fitted to the rays and ranges of views that last for seconds."""
+"""Fit points at rest, and points with a constant velocity, to the rays and ranges of views that last for seconds."""
 
 from __future__ import annotations
 
@@ -12,42 +12,43 @@ from objslam.core.rotation import cross
 from objslam.core.statistics import CAUCHY_K, NORMAL_MEDIAN, grouped_median, grouped_quantile, grouped_sums
 
 FEWEST = 3
-"""The fewest ranges of a view that is judged. Two ranges always follow a trend. A larger number judges fewer objects."""
+"""The fewest ranges of a view that is judged. Two ranges always follow a trend. With a larger number, fewer objects are
+judged."""
 _GAP = 2.0
-"""The longest time (s) between two rays of a visit that follow each other. A detector may miss a thing for a second. With a
-longer time, visits are joined."""
+"""The longest time (s) between two consecutive rays of a visit. A detector may miss a thing for a second. With a longer
+time, separate visits count as one."""
 _LONGEST = 4.0
-"""The longest time (s) of a view. People keep their velocity for some seconds. With a longer time, slower motions show, and
-people who turn do not."""
+"""The longest duration (s) of a view. People keep their velocity for some seconds. With a longer duration, slower motions
+show, but the motions of people who turn do not."""
 _PRIOR = 4.0
-"""The noise of the ranges of all labels weighs as much as this number of ranges in the noise of one label. With a larger
-number, labels differ less."""
+"""The weight of the noise of all labels in the noise of one label, as a number of ranges. With a larger number, labels
+differ less."""
 _LEAST_NOISE = 0.1
-"""The least noise of ranges, as a factor on their nominal noise. Simulated depths may have none. A larger factor finds fewer
-moving things."""
+"""The least noise of ranges, as a factor on their nominal noise. Simulated depths may have no noise. With a larger factor,
+fewer moving things are found."""
 _FASTEST = 10.0
-"""The standard deviation (m/s) of a velocity before the measurement. It only keeps a fit finite. A larger value changes
-hardly anything."""
+"""The prior standard deviation (m/s) of a velocity. It only keeps a fit finite. A larger value changes hardly anything."""
 _FAR = 100.0
-"""The standard deviation (m) of the place of a point before the measurement, from its object. It only keeps a fit finite. A
-larger value changes hardly anything."""
+"""The prior standard deviation (m) of the place of a point about its object. It only keeps a fit finite. A larger value
+changes hardly anything."""
 _LEAST_BIAS = 1e-3
 """The least standard deviation (m) of the error that the ranges of a view share. With a larger value, ranges that contradict
 the rays matter less."""
 _UNKNOWN_WIDTH = 0.5
-"""The width (m) of things whose boxes show no size. A larger width finds fewer moving things."""
+"""The assumed width (m) of things whose boxes show no size. With a larger width, fewer moving things are found."""
 _ROUNDS = 4
-"""The number of fits with robust weights. After four, the weights hardly change. A larger number takes longer."""
+"""The number of fits with robust weights. After four fits, the weights hardly change. A larger number takes longer."""
 
 
 @dataclass(frozen=True)
 class Sights:
-    """The rays and ranges (P,) of things (N).
+    """The P rays and ranges of N things.
 
-    thing: (P,) its number. time: (P,) s. origin: (P, 3) m. direction: (P, 3) unit. across: (P,) m, the noise of a ray at its
-    thing. range: (P,) m, NaN if unknown. nominal: (P,) m, the noise of the ranges, up to a factor for each label. bias: (P,)
-    m, of the error that the ranges of a thing share. half: (P,) half the width of the thing in m per m of its distance.
-    place: (N, 3) m. label: (N,).
+    thing: (P,) the number of each ray's thing. time: (P,) s. origin: (P, 3) m. direction: (P, 3) unit vectors. across: (P,)
+    m, the noise of a ray at the distance of its thing. range: (P,) m, NaN if unknown. nominal: (P,) m, the noise of the
+    range, up to a factor for each label. bias: (P,) m, the standard deviation of the error that the ranges of a thing share.
+    half: (P,) half the width of the thing, in m per m of its distance. place: (N, 3) m, the position of each thing. label:
+    (N,) the label of each thing.
     """
 
     thing: Ints
@@ -65,12 +66,13 @@ class Sights:
 
 @dataclass(frozen=True)
 class Views:
-    """V views of things: their rays that follow each other within seconds.
+    """V views of things. A view has the rays to a thing that follow each other within seconds.
 
-    sights: all rays, sorted by view. view: (P,) of each ray. time: (P,) s, from the middle of the view. thing, label: (V,).
-    visit: (V,) the number of its visit: views of a thing without a long gap between them. rays, number: (V,) how many rays
-    and ranges a view has. bias: (V,) m. seconds: (V,) s, from its first ray to its last. width: (V,) m, the largest width of
-    the thing.
+    sights: all rays, sorted by view. view: (P,) the view of each ray. time: (P,) s, of each ray, from the mean time of its
+    view. thing, label: (V,) the thing of each view, and the label of this thing. visit: (V,) the number of each view's
+    visit. A visit has the views of a thing without a long gap between them. rays, number: (V,) the numbers of rays and of
+    ranges of a view. bias: (V,) m, the mean `bias` of the ranges. seconds: (V,) s, from the first ray of a view to the last.
+    width: (V,) m, the largest width of the thing.
     """
 
     sights: Sights
@@ -87,7 +89,7 @@ class Views:
 
     @classmethod
     def of(cls, sights: Sights) -> Views:
-        """Return the views in the rays of things, at least one ray."""
+        """Return the views of things. sights: at least one ray."""
         order = np.lexsort((sights.time, sights.thing))
         rows = ("thing", "time", "origin", "direction", "across", "range", "nominal", "bias", "half")
         sights = Sights(**{name: getattr(sights, name)[order] for name in rows}, place=sights.place, label=sights.label)
@@ -120,8 +122,9 @@ class Views:
 
 @dataclass(frozen=True)
 class PointFit:
-    """A point for each of V views. cost: (V,) -2 ln likelihood, without a constant. along: (V,) the part of the ranges.
-    speed, variance: (V,) m/s and m^2/s^2, its velocity away from the robot. off: (P,) m, the residuals of the ranges."""
+    """The fit of a point to each of V views. cost: (V,) -2 ln of the likelihood, up to a constant. along: (V,) the part of
+    the cost from the ranges. speed: (V,) m/s, the point's velocity away from the robot. variance: (V,) m^2/s^2, the variance
+    of this speed. off: (P,) m, the residuals of the ranges."""
 
     cost: Floats
     along: Floats
@@ -134,7 +137,7 @@ def fit_point(views: Views, level: Floats, *, moving: bool) -> PointFit:
     """Fit a point to the rays and ranges of each view, with a constant velocity or at rest.
 
     Cauchy's loss bounds the influence of wrong ranges. The ranges of a view share an error. level: (V,) the factor on the
-    nominal noise of ranges.
+    nominal noise of ranges. moving: whether the points have a velocity.
     """
     sights, view, count, unknown = views.sights, views.view, len(views.thing), 7 if moving else 4
     to = sights.place[sights.thing] - sights.origin
@@ -176,10 +179,11 @@ def fit_point(views: Views, level: Floats, *, moving: bool) -> PointFit:
 
 
 def noise_about_motions(views: Views) -> Floats:
-    """Return the factors (V,) on the nominal noise of ranges: the scatter of the ranges of each label about points with a
-    constant velocity. At least one view has `FEWEST` ranges.
+    """Return the factors (V,) on the nominal noise of ranges, from the scatter of each label's ranges about points with a
+    constant velocity.
 
-    So the motion of a thing does not count as noise, and jumps of ranges between a thing and its background do.
+    So the motion of a thing does not count as noise, but jumps of ranges between a thing and its background do. views: at
+    least one view has `FEWEST` ranges.
     """
     labels, number = int(views.label.max()) + 1, views.number
     label, judged = views.label[views.view], np.isfinite(views.sights.range) & (number >= FEWEST)[views.view]

@@ -1,8 +1,7 @@
-"""Objects that the robot drove through. Such an object has moved, or it is no thing.
+"""Find objects that the robot drove through. Such an object has moved, or is no thing.
 
-Rays of things that are half hidden may cross at a place where nothing is, as in a doorway through which a robot saw parts of
-a couch. Then the boxes hardly show the mistake, but the robot drove there.
-"""
+Rays of things that are half hidden may cross at a place without a thing. An example is a doorway through which a robot saw
+parts of a couch. The boxes hardly show this mistake, but the robot's path may lead through the place."""
 
 import numpy as np
 
@@ -11,17 +10,18 @@ from objslam.core.bodies.body import Body
 from objslam.core.result import Doubt, RunResult
 
 _SIGMAS = 1.0
-"""The path must be inside the footprint of an object by this many standard deviations of its place. In simulated doorways,
-the robot drove 2 to 5 cm from the middle of such objects, whose standard deviations were 4 to 12 cm. A larger number names
-fewer objects."""
+"""The number of standard deviations of an object's place by which the path must be inside the object's footprint. In
+simulated doorways, the robot drove 2 to 5 cm from the middle of false objects, whose standard deviations were 4 to 12 cm.
+With a larger number, fewer objects are named."""
 _OVERLAP = 0.1
-"""The robot must overlap the body by at least this height (m). Mats and signs above the robot do not stop it. A larger
-height names fewer objects."""
+"""The least height (m) by which the robot must overlap the body. Mats, and signs above the robot, do not stop a robot. With
+a larger height, fewer objects are named."""
 _LOWEST = 0.2
-"""The least height (m) of a robot. If its camera is higher, the robot reaches up to the camera. A larger height names more
-objects."""
+"""The least assumed height (m) of a robot. If a camera is higher, the robot reaches up to this camera. With a larger height,
+more objects are named."""
 _NAMED = 3
-"""The most objects, or pairs of them, that a sentence of the assessment names. With a larger number, it is longer."""
+"""The most objects, or pairs of objects, that a sentence of the assessment names. With a larger number, the sentence is
+longer."""
 
 
 def driven_through(result: RunResult) -> list[Doubt]:
@@ -54,8 +54,8 @@ def driven_through(result: RunResult) -> list[Doubt]:
 
 
 def _inside(body: Body, position: Floats, covariance: Floats, path: Floats, top: float) -> Bools:
-    """Return where the path (N, 3), m, is inside a body at a position (3,) with a covariance (3, 3). top: m, the robot's
-    height."""
+    """Return a mask (N,) of the places of the path (N, 3), m, that are inside a body. position: (3,) m, and covariance: (3,
+    3) m^2, of the body. top: m, the robot's height."""
     c, s = np.cos(body.yaw), np.sin(body.yaw)
     axes = np.array([[c, s], [-s, c]])
     off = np.abs((path[:, :2] - position[:2]) @ axes.T)
@@ -67,7 +67,7 @@ def _inside(body: Body, position: Floats, covariance: Floats, path: Floats, top:
 
 
 def in_assessment(doubts: list[Doubt]) -> list[str]:
-    """Return the sentence about the objects for the assessment."""
+    """Return the sentence of the assessment about these objects, as a list that is empty without doubts."""
     if not doubts:
         return []
     names = first_names([f"{one.label} #{one.objects[0]}" for one in doubts])

@@ -1,4 +1,4 @@
-"""Loops that an exploration missed: a visit whose landmarks are copies of older ones is moved onto them."""
+"""Close loops that an exploration missed. A later visit has copies of older landmarks, and is moved onto these landmarks."""
 
 from __future__ import annotations
 
@@ -19,31 +19,32 @@ if TYPE_CHECKING:
     from objslam.mapping.joint.joint_alternation import JointState
 
     Attempts = dict[tuple[bytes, bytes], JointState | None]
-    """The attempts at closures of one state, by the landmarks `now` and `before` of each. None without a solution."""
+    """The attempts at closures of one state. The key has the landmarks `now` and `before` of a closure. The value is None if
+    the closure has no solution."""
 
 _BY_CHANCE = 5
-"""A part of a map is a copy if more than this number of its landmarks has the relative positions of others. With a larger
-number, smaller copies are not noticed. With a smaller one, rows of equal things look like copies, and other starts take
-time."""
+"""The largest number of landmarks of a map that may have the relative positions of others by chance. With more such
+landmarks, a part of the map is a copy. With a larger number, small copies are not noticed. With a smaller number, rows of
+equal things look like copies, and other starts take time."""
 _COMPARED = 2
-"""The number of loops with the most evidence that are compared before one of them is closed. Each takes a solve. A larger
-number is slower, and closes fewer wrong loops."""
+"""The number of loops that are compared before one is closed. They are those with the most evidence, and each takes a solve.
+With a larger number, the search is slower, and fewer wrong loops are closed."""
 _TRIED = 4
 """The most loops that are tried before the search ends. Loops with more evidence are tried first. Each takes a solve. A
 larger number closes more loops, and takes longer on maps that have missed none."""
 
 
 def with_missed_loops(state: JointState) -> JointState:
-    """Return the state after closures of loops that the exploration missed, if the log is then better explained.
+    """Return the state after closures of loops that the exploration missed, if these explain the log better.
 
     An unlikely slip, or one landmark that was taken for another, bends the path by more than the exploration allows for. All
     later visits then have landmarks of their own, all rays agree, and no round of association and solve brings the visits
     together. The copies of the landmarks still have the relative positions of the first ones, which reveal the loop.
 
     A closure joins landmarks and is solved at once, at held shared errors. The rounds of association follow after the last
-    closure. Earlier rounds would give the rays of visits that are not closed yet to wrong landmarks. First, each closure
-    must explain the log better. Then all loops are closed that copies of relative positions show. state: without a
-    localisation.
+    closure. Earlier rounds would give the rays of visits that are not closed yet to wrong landmarks. First, loops are closed
+    one by one, and each closure must explain the log better. Then all loops are closed that copies of relative positions
+    show. state: without a localisation.
     """
     held = replace(state, hold=state.errors is not None)
     best = held
@@ -51,7 +52,7 @@ def with_missed_loops(state: JointState) -> JointState:
     while not best.spent and (closed := _with_a_loop(best, solved)) is not None:
         best, solved = closed, {}
     if best is not held:
-        solved = {}  # They are closures of another state.
+        solved = {}  # These were closures of another state.
         try:
             best = state.better(best.released(state.hold))
         except SolveError:  # The map without the closures is there.
@@ -62,11 +63,11 @@ def with_missed_loops(state: JointState) -> JointState:
 
 
 def _with_all_loops(state: JointState, solved: Attempts) -> JointState:
-    """Return the state after closures of all loops that copies show, and rounds, if the log is then better explained.
+    """Return the state after closures of all loops that copies show, and rounds, if these explain the log better.
 
     A single closure may explain the log worse. Some rays of a later visit belong to wrong landmarks of an earlier one, and
-    fit only the bent path. The rounds free these rays, but only if all parts of the path are where they should be. A solved
-    closure is not merged, because landmarks of parts that are not closed yet stand between the others.
+    fit only the bent path. The rounds free these rays, but only if all parts of the path are in the right place. Other
+    objects are not merged after a closure, because landmarks of parts that are not closed yet stand between the others.
 
     solved: the closures of this state that are solved already.
     """
@@ -93,8 +94,8 @@ def _with_all_loops(state: JointState, solved: Attempts) -> JointState:
 def largest_copy(
     rays: Rays, association: Association, positions: Floats, map_T_camera: Floats, of: AssociationSettings
 ) -> int:
-    """Return the number of landmarks in the largest part of a map that is a copy of another part, at another place. Such a
-    map has missed a loop. 0 without a copy.
+    """Return the number of landmarks in the largest part of a map that is a copy of another part at another place. A map
+    with a copy has missed a loop. Without a copy, the number is 0.
 
     All rays can agree with such a map. A copy is sure if more than `_BY_CHANCE` landmarks have the relative positions of
     others, with the evidence of a loop (`_copies`). positions: (N, 3) m, NaN if unknown. map_T_camera: (K, 4, 4)."""
@@ -113,11 +114,12 @@ def largest_copy_in(state: JointState) -> int:
 
 
 def _copies(landmarks: Landmarks, middle: Floats, map_T_camera: Floats, of: AssociationSettings) -> list[Closure]:
-    """Return the loops that copies show, with the most evidence first. middle: (N,), map_T_camera: (K, 4, 4).
+    """Return the loops that copies show, with the most evidence first. middle: (N,) as from `_landmarks`. map_T_camera: (K,
+    4, 4).
 
-    Of many searches, one may find a loop by chance. So the evidence must be larger than for a loop of a single search
-    (`association.loop_evidence`), by the logarithm of the number of searches (Bonferroni). Where things repeat, as the doors
-    of a corridor do, it must be larger than that of matches which are certainly wrong, by `association.loop_lead`."""
+    Among many searches, one may find a loop by chance. So the evidence must exceed that for a single search
+    (`association.loop_evidence`) by the logarithm of the number of searches (Bonferroni). Where things repeat, like the
+    doors of a corridor, the evidence must also exceed that of certainly wrong matches by `association.loop_lead`."""
     from objslam.graph.loop_closure import SEARCHES, find_missed_closures
 
     enough = of.loop_evidence + np.log(SEARCHES)
@@ -138,8 +140,8 @@ def _with_rounds(state: JointState) -> JointState:
 
 
 def _with_a_loop(state: JointState, solved: Attempts) -> JointState | None:
-    """Return the state after the closure of one loop that explains the log better. None without one. solved: takes each
-    closure that was tried."""
+    """Return the state after the closure of one loop that explains the log better. Return None if there is no such loop.
+    solved: each closure that is tried is added here."""
     from objslam.graph.loop_closure import find_missed_closures
 
     landmarks, middle = _of_state(state)
@@ -162,7 +164,7 @@ def _of_state(state: JointState) -> tuple[Landmarks, Floats]:
 def _landmarks(
     rays: Rays, association: Association, positions: Floats, map_T_camera: Floats, min_rays: int
 ) -> tuple[Landmarks, Floats]:
-    """Return the landmarks of a map, and the median keyframe of the rays of each (N,), NaN without enough rays."""
+    """Return the landmarks of a map, and the median keyframe (N,) of each landmark's rays. It is NaN without enough rays."""
     from objslam.graph.loop_closure import Landmarks, covariances_at
 
     label, position, owner = association.label, np.nan_to_num(positions), association.object
@@ -175,8 +177,8 @@ def _landmarks(
 
 
 def _closed(state: JointState, closure: Closure, landmarks: Landmarks, solved: Attempts) -> JointState | None:
-    """Return an attempt after the solve of a closure. None if it has no solution. solved: of this state. A closure that is
-    in it is not solved again."""
+    """Return an attempt after the solve of a closure. Return None if it has no solution. solved: the closures of this state
+    that are solved already, which are not solved again."""
     which = closure.now.tobytes(), closure.before.tobytes()
     if which not in solved:
         solved[which] = _solved(state, closure, landmarks)

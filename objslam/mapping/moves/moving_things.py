@@ -1,4 +1,5 @@
-"""Objects of things that move: people walk through a place again and again, and their rays seem to meet there."""
+"""Drop objects of things that move. For example, people walk through a place again and again, and their rays seem to meet
+there."""
 
 from __future__ import annotations
 
@@ -23,44 +24,45 @@ if TYPE_CHECKING:
     from objslam.mapping.joint.joint_alternation import JointState
 
 _PURE = 0.95
-"""A track of a thing at rest has all its rays at one object. A track that passes through an object has other rays too. An
-object may be of a thing that moves if the mean share of its rays in their tracks is below this. Of 100 simulated things at
-rest, two had 0.87 and 0.9, and the others 0.92 and more. A larger share drops more objects."""
+"""The mean share of an object's rays in their tracks below which the object may be of a thing that moves. A track of a thing
+at rest has all its rays at one object. A track that passes through an object has other rays too. Of 100 simulated things at
+rest, two had 0.87 and 0.9, and the others 0.92 and more. With a larger share, more objects are dropped."""
 _PASSED = 0.85
-"""The things of a label may move if the mean share of its rays in their tracks is below this. People and carts that drive
-around had 0.2 to 0.75 in simulations. A larger share drops more objects."""
+"""The same mean share for all objects of a label, below which the things of the label may move. People and carts that drive
+around had 0.2 to 0.75 in simulations. With a larger share, more objects are dropped."""
 _HELD = 0.93
-"""The things of a label may move if the share of its rays in tracks that are of objects is below this. Rays to a thing that
-moves meet at few of its places. Simulated carts had 0.56 to 0.86, and pallets in rows, whose tracks join neighbours, 0.98. A
-larger share drops more objects."""
+"""The share of a label's rays in tracks that have an object, below which the things of the label may move. Rays to a thing
+that moves meet at few of its places. Simulated carts had 0.56 to 0.86. Pallets in rows, whose tracks join neighbours, had
+0.98. With a larger share, more objects are dropped."""
 _SCATTER = 1.5
-"""The things of a label move only if the root mean square of its rays is more than this multiple of the usual one. Tracks
-also pass from one thing to the next where equal things stand close together, but their rays fit. Single real landmarks in
-groups had 0.8 to 2.0. All objects of people together had 3 and more, and all objects of carts together had 1.9 to 2.4. A
-larger multiple drops fewer objects."""
+"""The multiple of the usual root mean square residual that the rays of a label must exceed, so that its things move. Tracks
+also pass from one thing to the next where equal things stand close together, but then the rays fit. Single real landmarks in
+groups had 0.8 to 2.0. All objects of people together had 3 and more, and all objects of carts together had 1.9 to 2.4. With
+a larger multiple, fewer objects are dropped."""
 _LONG = 6
-"""The fewest rays of a track that shows that a thing of a moving label is at rest. The rays of shorter tracks meet in a
-point even if the thing moves: a cart with four rays in tracks of three passed for a thing at rest. A larger number drops
-more objects of such labels."""
+"""The fewest rays of a track that can show that a thing of a moving label is at rest. The rays of a shorter track meet in a
+point even if the thing moves. For example, a cart with four rays in tracks of three passed for a thing at rest. With a
+larger number, more objects of such labels are dropped."""
 _FOLLOWS = 0.3
-"""A label wanders if more than this share of its rays in long tracks follows things that move. Recorded robots had 0.3 to 1.
-With 0.25, a thing at rest was lost whose label two moving things have too. With 0.4, recorded robots became two more objects
-in five minutes. A larger share finds fewer moving labels."""
+"""The share of a label's rays in long tracks that must follow things that move, so that the label wanders. Recorded robots
+had 0.3 to 1. With 0.25, a thing at rest was lost that has its label in common with two moving things. With 0.4, recorded
+robots became two more objects in five minutes. With a larger share, fewer moving labels are found."""
 _VISITS = 2
-"""The fewest visits to a thing at rest whose label wanders. In one visit, the rays to a robot that drives on a line
-often meet in a point, and nothing but a second visit shows that it was chance. A larger number drops more objects."""
+"""The fewest visits to an object that is kept although its label wanders. In one visit, the rays to a robot that drives on a
+line often meet in a point. Only a second visit shows that this was chance. With a larger number, more objects are
+dropped."""
 _AWAY = 5.0
 """The shortest time (s) between two visits. In a longer time, a thing that moves gets farther. With a longer time, objects
-have fewer visits, and more of moving labels are dropped."""
+have fewer visits, and more objects of moving labels are dropped."""
 _APART = 3.0
-"""The rays of a track meet in no point if the root mean square of their residuals is more than this multiple of the usual
-one. Recorded robots that other robots saw had 0.4 to 60. A larger multiple finds fewer moving labels."""
+"""The multiple of the usual root mean square residual above which the rays of a track meet in no point. Recorded robots that
+other robots saw had 0.4 to 60. With a larger multiple, fewer moving labels are found."""
 _EXPLAINED = 0.8
-"""The least share of the rays of a track that are of objects, if the track is of things at rest. Recorded landmarks had 0.98
-and more, and recorded robots 0.5 on average. A larger share finds more moving labels."""
+"""The least share of a track's rays that have an object, at which the track is of things at rest. Recorded landmarks had
+0.98 and more, and recorded robots 0.5 on average. With a larger share, more moving labels are found."""
 _USUAL = 3
-"""The fewest objects from which the usual scatter is measured: those whose tracks have hardly any other rays, and whose
-label does not seem to move. With a larger number, fewer maps are judged."""
+"""The fewest objects from which the usual scatter is measured. These are objects whose tracks have hardly any other rays,
+and whose label does not seem to move. With a larger number, fewer maps are judged."""
 
 
 def without_moving_things(state: JointState) -> JointState:
@@ -73,9 +75,9 @@ def associated_at_rest(state: JointState) -> JointState:
 
     The solve bent the path to rays that meet by chance. At a bent path, a thing at rest may have one object for each visit,
     and some of its rays are at no object or at a wrong one. So objects that appear twice are merged at the new path. Rounds
-    of association follow, and count if they explain the log better. Of the labels that move, these rounds find no objects
-    either. Things that move along the view are single objects, which hardly bend a path. If only these are dropped, no
-    rounds follow.
+    of association follow, and count if they explain the log better. Objects of moving labels that these rounds find are
+    dropped too. Things that move along the view are single objects, which hardly bend a path. If only such objects are
+    dropped, no rounds follow.
     """
     left, labels = _dropped(state, np.zeros(0, dtype=np.int64))
     if left is state or not len(labels):
@@ -128,13 +130,13 @@ def things_at_rest(
 
     The rays of people who walk through a room meet by chance near some points, because there are many of them. A round of
     association takes each ray by itself. But boxes of images that follow each other show one thing. If it moves, its track
-    passes through the object, and the rays before and after belong to no object or to another one. Labels are judged,
+    passes through the object, and the rays before and after belong to no object or to another one. Whole labels are judged,
     because tracks of a few things at rest also pass on to equal things beside them. If nearly all rays of a label have an
-    object, its things are at rest. Of a label that moves, objects stay only
-    if long tracks show that they are at rest. If all things have one label, the usual scatter is unknown, and all objects
-    stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses. known: labels that are known to move. names: the
-    labels that are known to be names of things at rest, whose objects stay. along: (N,) objects of things that move, as
-    their ranges show (`things_along_the_view`).
+    object, its things are at rest. An object of a moving label stays only if long tracks show that it is at rest. If all
+    things have one label, the usual scatter is unknown, and all objects stay. estimate: the estimate of the association.
+    map_T_camera: (K, 4, 4) the poses of the estimate. known: labels that are known to move. names: labels that are known to
+    be names of things at rest. Their objects stay. along: (N,) a mask of the objects whose ranges show that their things
+    move (`things_along_the_view`).
     """
     moving = _moving(keyframes, rays, association, estimate, map_T_camera, settings, known)
     if along is not None:
@@ -145,7 +147,8 @@ def things_at_rest(
 
 
 def without_things(association: Association, gone: Bools) -> Association:
-    """Return the association without some of its objects (N,), whose rays are refuted. It is the same if none is gone."""
+    """Return the association without the objects in the mask `gone` (N,). Their rays become refuted. If the mask is empty,
+    the association itself is returned."""
     if not gone.any():
         return association
     number = np.append(np.where(gone, -1, np.cumsum(~gone) - 1), -1)
@@ -169,7 +172,7 @@ def _moving(
     settings: Settings,
     known: Ints | None,
 ) -> Bools:
-    """Return which objects (N,) are of things that move. The parameters are as in `things_at_rest`."""
+    """Return a mask (N,) of the objects of things that move. The parameters are as in `things_at_rest`."""
     owner = np.where(estimate.weight > 0, association.object, -1)
     track, length = tracks_of_rays(keyframes, rays, map_T_camera)
     told = np.flatnonzero((owner >= 0) & (length[track] >= FEWEST))
@@ -221,20 +224,15 @@ def _wander(
     usual: float,
     noise: RayNoise,
 ) -> Bools:
-    """Return the labels (L,) whose boxes follow things that move.
+    """Return a mask (L,) of the labels whose boxes follow things that move.
 
-    A track follows such a thing if its rays meet in no point, are not parallel as those to a far thing are, and are not of
-    objects. Tracks also pass on to equal things nearby, but then their rays are of objects. A label wanders if more than the
-    share `_FOLLOWS` of its rays in long tracks is in such tracks.
+    A track follows a thing that moves under three conditions. Its rays meet in no point. They are not parallel, as rays to a
+    far thing are. And they have no objects. Tracks also pass on to equal things nearby, but then their rays have objects. A
+    label wanders if more than the share `_FOLLOWS` of its rays in long tracks is in such tracks.
 
-    Args:
-        keyframes, rays: of the map.
-        track: (R,) -1 for a ray without a long track.
-        owner: (R,) the object of each ray that agrees, else -1.
-        map_T_camera: (K, 4, 4).
-        settings: of the run.
-        usual: the mean square of the residuals of a thing at rest, in variances of a ray.
-        noise: of the rays.
+    Args: keyframes, rays: of the map. track: (R,) -1 for a ray without a long track. owner: (R,) the object of each ray that
+    agrees, else -1. map_T_camera: (K, 4, 4). settings: of the run. usual: the mean square of the residuals of a thing at
+    rest, in variances of a ray. noise: of the rays.
     """
     from objslam.graph.fixed_pose_triangulation import triangulate_at
 

@@ -1,10 +1,9 @@
-"""The sides of things that boxes show, as seen in the poses of a solve.
+"""Check whether a solve moved the cameras back, which shows that the objects of a row may be at wrong places.
 
-A camera sees the near sides of a thing, and things in front hide parts of it. So rays from one side cross before its centre,
-and a solve of poses moves the cameras ahead until they cross at the centre. No thing moves cameras back. But in a row of
-large equal things, rays from one end of the row can cross those from the other end at the wrong neighbour. All things then
-lie half a spacing off, and the cameras move back.
-"""
+A camera sees the near side of a thing, and other things hide parts of the thing. So rays from one side cross before the
+centre of the thing, and a solve of poses moves the cameras ahead until the rays cross at the centre. A single thing never
+moves the cameras back. But in a row of large equal things, rays from one end of the row can cross rays from the other end at
+the wrong neighbour. All things then lie half a spacing off, and the cameras move back."""
 
 from __future__ import annotations
 
@@ -22,16 +21,18 @@ if TYPE_CHECKING:
     from objslam.mapping.solution import Solution
 
 _STRETCHES = 10
-"""The number of stretches of a drive whose mean shifts count as independent. Fewer stretches are less exact."""
+"""The number of stretches of a drive whose mean shifts count as independent. With fewer stretches, the standard deviation of
+the shift is less exact."""
 _LEVEL = 0.5
-"""The least level part of the viewing direction of a camera that counts. Cameras that look down see the tops of things."""
+"""The least horizontal part of the unit viewing direction of a camera that counts. Cameras that look down see the tops of
+things."""
 _CLEAR = 2.0
-"""A shift is clear if it is at least this many standard deviations, and at least this multiple of `localization.xy`. With a
-larger number, fewer maps are doubted. In simulations of rows, wrong maps have shifts of -5 to -75 cm at 2.4 to 20 standard
-deviations, and right maps have 4 to 19 cm ahead. Other maps have -5 to 2 cm, and recorded robots -2 to 2 cm."""
+"""The number of standard deviations that a clear shift exceeds. The shift must exceed the same multiple of `localization.xy`
+too. With a larger number, fewer maps are doubted. In simulations of rows, wrong maps have shifts of -5 to -75 cm at 2.4 to
+20 standard deviations, and right maps have 4 to 19 cm ahead. Other maps have -5 to 2 cm, and recorded robots -2 to 2 cm."""
 _RANGED = 0.5
-"""The share of the used rays with ranges from which they tell a row apart, because a ray of a neighbour has another range. A
-larger share doubts more maps with ranges. Logs have ranges for nearly all boxes or for none."""
+"""The share of the used rays with ranges from which a map is not doubted. A ray to a neighbour in a row has another range.
+With a larger share, more maps with ranges are doubted. Logs have ranges for nearly all boxes or for none."""
 BACK = "rows of equal things that may be off by half their spacing"
 """The name of the finding that a solve moved the cameras back."""
 
@@ -39,10 +40,12 @@ BACK = "rows of equal things that may be off by half their spacing"
 def shift_ahead(
     keyframes: Keyframes, map_T_base: Floats, calibration: Calibration | None, cameras: tuple[str, ...]
 ) -> tuple[float, float]:
-    """Return how far a solve moved the cameras along their level viewing directions, m, and its standard deviation.
+    """Return the mean shift (m) of the cameras along their horizontal viewing directions by a solve, and its standard
+    deviation (m).
 
-    It is (0, 0) without a level camera. keyframes: with the given poses. map_T_base: (K, 4, 4) the solved poses.
-    calibration: its translations of cameras count too. cameras: their names.
+    The result is (0, 0) if all cameras look up or down. keyframes: the keyframes with the given poses. map_T_base: (K, 4, 4)
+    the solved poses. calibration: the shared errors, whose translations of cameras count too. cameras: the names of the
+    cameras.
     """
     ahead = (map_T_base @ keyframes.base_T_camera)[:, :2, 2]
     level = np.linalg.norm(ahead, axis=1)
@@ -57,14 +60,15 @@ def shift_ahead(
 
 
 def moves_back(shift: tuple[float, float], settings: Settings) -> bool:
-    """Return whether a shift is clearly back."""
+    """Return whether the cameras clearly moved back. shift: from `shift_ahead`."""
     return shift[0] < -_CLEAR * max(settings.localization.xy, shift[1])
 
 
 def check_rows(solution: Solution, cameras: tuple[str, ...], settings: Settings) -> Finding | None:
     """Return a finding if a joint solve at localised poses moved the cameras back, and labels have several objects.
 
-    None if most rays have ranges, which show a neighbour. Then cameras also move back because ranges are too long.
+    The result is None if most rays have ranges, because ranges distinguish neighbours. With ranges, cameras may also move
+    back because the ranges are too long.
     """
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     used = (estimate.weight > 0) & (association.object >= 0)
@@ -86,7 +90,7 @@ def check_rows(solution: Solution, cameras: tuple[str, ...], settings: Settings)
 
 
 def _translations(calibration: Calibration | None, cameras: tuple[str, ...]) -> Floats:
-    """Return how far the calibration moves each camera on the robot, (C, 2) m."""
+    """Return the horizontal shifts (C, 2) m of the cameras on the robot by the calibration."""
     moved = np.zeros((len(cameras), 2))
     if calibration is None:
         return moved

@@ -1,7 +1,7 @@
-"""The odometry as a witness against a localisation, before any ray has an object.
+"""Compare a localisation with the odometry, before any ray has an object.
 
-False objects take up a part of the errors of poses, so the rays show too small errors. The odometry knows no objects.
-"""
+False objects take up a part of the errors of poses, so the rays show too small errors. The odometry does not depend on
+objects."""
 
 from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
@@ -15,33 +15,34 @@ from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.turning_clocks import clocks_of_turns
 
 _LONG = 5.0
-"""The least duration (s) of errors that count. Shorter ones may come from a clock. If the clock of the odometry is 0.2 s
-late, the errors last as long as a turn, which is 2 to 4 s in recorded drives. A larger value misses shorter errors."""
+"""The least duration (s) of errors that count. Shorter errors may come from a clock. If the clock of the odometry is 0.2 s
+late, the errors last as long as a turn, which takes 2 to 4 s in recorded drives. With a larger value, shorter errors are
+missed."""
 
 
 def odometry_contradicts(log: Log, settings: Settings) -> bool:
     """Return whether the odometry shows that the localisation errs for seconds, by at least the noise in the settings
     `localization`.
 
-    Both paths are compared at the clocks that the turns of the robot show. A localisation that agrees with its settings, and
-    a log without odometry at its frames, give False.
+    Both paths are compared at the clock offsets that the turns of the robot show. The result is False if the localisation
+    agrees with its settings, or if the log has no odometry at its frames.
     """
     if log.odometry is None or log.localization is None:
         return False
     joint = settings.model_copy(update={"mode": "joint"})
     try:
         frames = build_keyframes(log, joint, Ledger())
-    except LogError:  # The odometry has no pose at any frame, so it says nothing. The map at the localisation is there.
+    except LogError:  # The odometry has no pose at any frame, so there is nothing to compare.
         return False
     rays = build_rays(log, frames, joint, Ledger())
     return max(lasting_by_odometry(shared_errors(log, frames, rays, joint))) >= 1
 
 
 def lasting_by_odometry(errors: SharedErrors | None) -> tuple[float, float]:
-    """Compare the localisation with the odometry. Return how large its lasting errors are, as factors on `localization.yaw`
-    and `localization.xy`. The factors are 0 without odometry, or if the noise of the localisation is known.
+    """Return the sizes of the localisation's lasting errors, as the odometry shows them. They are factors on
+    `localization.yaw` and `localization.xy`. Both are 0 without odometry, or if the noise of the localisation is known.
 
-    errors: of all frames, because frames without a box count too.
+    errors: the shared errors with all frames, because frames without a box count too.
     """
     if errors is None or "localization" not in errors.unknown_noise or errors.keyframes.odom_T_base is None:
         return 0.0, 0.0

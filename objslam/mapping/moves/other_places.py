@@ -1,7 +1,6 @@
-"""Objects that are one thing at several places: it stood at one place, moved, and stood at another.
+"""Find objects that are one thing at several places. The thing stood at one place, moved, and stood at another.
 
-A thing at rest is seen whenever it is in view. One that has moved away is in view no longer: its old place is, without it.
-"""
+A thing at rest is seen whenever its place is in view. After a thing has moved away, its old place is in view without it."""
 
 from itertools import product
 
@@ -14,32 +13,37 @@ from objslam.core.result import Doubt, RunResult
 from objslam.mapping.moves.driven_through import first_names
 
 _FACTOR = 3
-"""A place without its thing must be in view in this multiple of the frames of any object of another label. Walls hide things
-too, because no box shows a wall: in a home of two rooms, clocks came to 1.0 and 1.2 times, and a simulated robot that stood
-at two places came to 11 and 13 times. With a larger number, fewer things are named."""
+"""The least number of frames with a place in view without its thing, as a multiple of the largest such number of any object
+of another label. Walls cause such frames too, because no box shows a wall that hides a thing. In a home of two rooms, clocks
+had 1.0 and 1.2 times this number. A simulated robot that stood at two places had 11 and 13 times. With a larger multiple,
+fewer things are named."""
 _FRAMES = 10
-"""The least number of frames with a place without its thing. With a larger number, fewer things are named."""
+"""The least number of frames with a place in view without its thing. With a larger number, fewer things are named."""
 _OTHERS = 5
-"""The least number of objects of other labels to compare with. With a larger number, fewer maps are judged."""
+"""The fewest objects of other labels with which an object can be compared. With a larger number, fewer maps are judged."""
 _BESIDE, _BEHIND = np.cos(np.radians(20.0)), 0.9
-"""A camera sees past a place if it detects a thing beside or behind it: the cosine of the largest angle between the two, and
-the least distance of this thing, as a share of the place's distance. No wall hides the place then, unless it ends between
-the two. With a smaller angle or a larger share, fewer frames count."""
+"""The limits for a thing that shows that a camera sees past a place. `_BESIDE` is the cosine of the largest angle between
+the directions to the thing and to the place. `_BEHIND` is the least distance of the thing, as a share of the place's
+distance. If the camera detects such a thing, no wall hides the place, unless the wall ends between the two. With a smaller
+angle or a larger share, fewer frames count."""
 _USUAL = 0.9
-"""The quantile, over the objects, of the most frames that see past an object between two boxes of it. The other objects may
-be several things, or have moved. In a simulated room with six of 27 things that moved, it was 7 frames, and the places of
-those that moved were seen past without them in 11 to 48 frames. With a larger quantile, fewer things are named."""
+"""The quantile, over the objects, of the most frames that see past an object between two consecutive boxes of it. Objects
+above the quantile may be several things, or may have moved. In a simulated room, six of 27 things moved. The quantile was 7
+frames, and the cameras saw past the places of the moved things in 11 to 48 frames. With a larger quantile, fewer things are
+named."""
 
 Without = tuple[Ints, Ints, Ints, Ints]
-"""Four arrays (N,): the number of frames with an object's place in view before its first box, and after its last box, and
-the frames of these boxes. The frames of an object without a box are -1."""
+"""Four arrays (N,), one value for each object. The first two are the numbers of frames with the object's place in view:
+before its first box, and after its last box. The other two are the frames of the first and of the last box, -1 for an object
+without a box."""
 
 
 def at_other_places(result: RunResult, state: State, objects: Ints) -> list[Doubt]:
     """Return a doubt for each pair of objects of one label that is likely one thing that moved.
 
-    The first object was seen for the last time before the second one was seen first. Its place came into view later, and
-    the place of the second one had been in view before. state: of N objects. objects: (N,) their indices in the map.
+    The first object was last seen before the second object was first seen. The place of the first object came into view
+    later, without it. The place of the second object had been in view before, without it. state: the state of N objects.
+    objects: (N,) the indices of the objects in the map.
     """
     if not len(objects):
         return []
@@ -69,7 +73,7 @@ def at_other_places(result: RunResult, state: State, objects: Ints) -> list[Doub
 
 
 def _nearest_first(pairs: set[tuple[int, int]], position: Floats) -> list[tuple[int, int]]:
-    """Return pairs in which no object left twice or came twice: a thing goes to one place. Near pairs go before far ones.
+    """Return the pairs that are left if no object may leave twice or come twice. Near pairs are preferred to far ones.
 
     position: (N, 3) m.
     """
@@ -81,16 +85,19 @@ def _nearest_first(pairs: set[tuple[int, int]], position: Floats) -> list[tuple[
 
 
 def _pairs(history: DetectionHistory, label: Ints) -> list[tuple[int, int]]:
-    """Return the pairs of objects whose places are in view without them far longer than those of all other labels."""
+    """Return the pairs of objects whose places are in view without them for far more frames than those of objects of other
+    labels."""
     without = _without(history, np.ones(len(history.frame), dtype=bool))
     return _left_and_came(without, label, _FACTOR * _largest_of_others(np.maximum(*without[:2]), label))
 
 
 def _pairs_seen_past(state: State, label: Ints) -> list[tuple[int, int]]:
-    """Return the pairs of objects whose places are seen past without them far longer than those of things at rest.
+    """Return the pairs of objects past whose places cameras see, without the objects, in far more frames than for things at
+    rest.
 
-    If things of two labels moved, or a thing was taken away, no pair stands out from all objects of other labels. A thing is
-    at rest between its first box and its last one. So its misses between two boxes say how long things at rest are missed.
+    If things of two labels moved, or a thing was taken away, no pair differs clearly from all objects of other labels. But a
+    thing is at rest between its first and its last box. So the misses between its boxes show in how many frames things at
+    rest are missed.
     """
     history, past = state.history, _seen_past(state, label)
     without = _without(history, past)
@@ -99,7 +106,8 @@ def _pairs_seen_past(state: State, label: Ints) -> list[tuple[int, int]]:
 
 
 def _longest_misses(history: DetectionHistory, counts: Bools, first: Ints, last: Ints) -> Ints:
-    """Return the most frames (N,) without each object between two boxes of it. counts: (V,) which frames count."""
+    """Return the most frames (N,) without each object between two consecutive boxes of it. counts: (V,) a mask of the
+    entries of the history that count."""
     between = counts & (history.frame > first[history.object]) & (history.frame < last[history.object])
     missed = np.flatnonzero(between & ~history.detected)
     box_before = np.cumsum(history.detected)  # The pairs are sorted by object, so it is a box of the same object.
@@ -109,10 +117,10 @@ def _longest_misses(history: DetectionHistory, counts: Bools, first: Ints, last:
 
 
 def _left_and_came(without: Without, label: Ints, least: Floats | Ints) -> list[tuple[int, int]]:
-    """Return the pairs of objects of one label whose first one left before the second one came.
+    """Return the pairs of objects of one label in which the first object left before the second one came.
 
-    least: (N,) the least number of frames with the place of each object after it left, or before it came. Fewer than
-    `_FRAMES` are never enough, nor is a map with too few objects of other labels.
+    least: (N,) the least number of frames with the place of each object in view after it left, or before it came. Fewer than
+    `_FRAMES` frames are never enough. An object needs `_OTHERS` objects of other labels.
     """
     before, after, first, last = without
     judged = (first >= 0) & (len(label) - np.bincount(label)[label] >= _OTHERS)
@@ -121,9 +129,9 @@ def _left_and_came(without: Without, label: Ints, least: Floats | Ints) -> list[
 
 
 def _seen_past(state: State, label: Ints) -> Bools:
-    """Return in which frames (V,) of the history without its object a camera sees past the place of the object.
+    """Return a mask (V,) of the entries of the history without a box in which the camera sees past the place of the object.
 
-    A thing of the same label does not count, because its box may be one of the object.
+    A thing of the same label does not count, because its box may be of the object itself.
     """
     history, origin = state.history, state.view.map_T_camera[:, :3, 3]
     toward = state.landmarks.position[history.object] - origin[history.frame]
@@ -154,7 +162,8 @@ def _largest_of_others(value: Ints, label: Ints) -> Ints:
 
 
 def _without(history: DetectionHistory, counts: Bools) -> Without:
-    """Return the frames without each object. counts: (V,) which frames of the history count."""
+    """Return the frames without each object, as in `Without`. counts: (V,) a mask of the entries of the history that
+    count."""
     count = len(history.inside)
     seen = history.detected
     first, last = np.full(count, np.iinfo(np.int64).max), np.full(count, -1)
@@ -168,7 +177,7 @@ def _without(history: DetectionHistory, counts: Bools) -> Without:
 
 
 def in_assessment(doubts: list[Doubt]) -> list[str]:
-    """Return the sentence about the objects for the assessment."""
+    """Return the sentence of the assessment about these objects, as a list that is empty without doubts."""
     if not doubts:
         return []
     pairs = first_names([f"{one.label} #{one.objects[0]} and #{one.objects[1]}" for one in doubts])

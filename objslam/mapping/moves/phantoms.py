@@ -1,4 +1,4 @@
-"""Phantoms: objects where rays of several things meet at poses that err. They are dropped, or a finding warns of them."""
+"""Drop phantoms, or warn of them. A phantom is an object where rays of several things meet, because the poses err."""
 
 from __future__ import annotations
 
@@ -23,35 +23,34 @@ if TYPE_CHECKING:
     from objslam.mapping.solution import Solution
 
 _LARGE = 1.0
-"""Phantoms are searched if the errors of a localisation that last for seconds are at least this multiple of `localization`.
-From this value on, the errors that last are as large as all errors should be. With a larger value, fewer maps take the time
-of the search."""
+"""The least size of a localisation's errors that last for seconds, as a multiple of the noise `localization`, at which
+phantoms are searched. At 1, the lasting errors alone are as large as all errors together should be. With a larger value,
+fewer maps take the time of the search."""
 _APART = 2.0
-"""Lasting errors of poses shift the rays to a thing, far ones by more. Two things of one label cannot be told apart if the
-distance between them is less than this multiple of the shift. A ray errs by more than 2 standard deviations in 5 % of the
-cases. A larger value warns of more maps."""
+"""The least distance between two things of one label that can be distinguished, as a multiple of the shift of their rays.
+Lasting errors of poses shift the rays to a thing, and the shift grows with its distance. A ray errs by more than 2 standard
+deviations in 5 % of the cases. With a larger value, runs warn of more maps."""
 BENT = "a path that may be bent to false objects"
 """The name of the finding that the odometry contradicts both the poses and the boxes. The path may then be bent, because
 some labels have several objects."""
 _BENT = 3.0
-"""False objects can hide how far the poses err, because the path was bent to them. A run warns of this under two
-conditions. An earlier map at the given poses showed that the poses err. And the solve now finds the odometry at least this
-many times as noisy as the settings say. At 3, the settings explain only a ninth of the variance. A larger value warns of
-fewer maps."""
+"""The least factor on the noise of the odometry at which a run warns of false objects. A path that is bent to false objects
+hides how far the poses err. An earlier map at the given poses must also have shown that the poses err. At 3, the settings
+explain only a ninth of the variance. With a larger value, runs warn of fewer maps."""
 UNTOLD = "errors of poses that the solve does not show"
 """The name of the finding that a map at the given poses shows large errors of the poses, and the solved map shows none."""
 _MOST = 60
-"""The most objects that are tried as phantoms. The least likely objects are tried first. Each takes a search of the path and
-a solve. A larger number finds more phantoms in large maps, and takes longer."""
+"""The most objects that are tried as phantoms. The least likely objects are tried first. Each object takes a search of the
+path and a solve. With a larger number, more phantoms are found in large maps, and the search takes longer."""
 _LOST = 0.5
-"""An object is no phantom if more than this share of its rays belongs to no object without it. Then they count as false
-boxes, which explains the log worse. Three phantoms of simulated drives lost 0 to 0.2 of their rays. Objects that lost more
-than half lowered the log odds by 17 and more. With a larger share, more objects are tried with a solve."""
+"""The largest share of a phantom's rays that find no other object when the phantom is taken out. Such rays count as false
+boxes, which explains the log worse. Three phantoms of simulated drives had 0 to 0.2. Without an object that had more than
+half, the log odds fell by 17 and more. With a larger share, more objects are tried with a solve."""
 _COARSE = 100.0
-"""If the most likely path with all objects loses more log evidence than this, phantoms are not searched. The path search is
-then too coarse for the log, and each path without an object loses about as much. In 12 simulated drives the path lost at
-most 20, and a dropped object gained at most 50. In a museum, it lost 360 or more with each of 60 objects taken out. With
-a larger value, more logs take the time of the search."""
+"""The largest loss of log evidence on the most likely path with all objects, at which phantoms are searched. With a larger
+loss, the path search is too coarse for the log, and each path without an object loses about as much. In 12 simulated drives
+the path lost at most 20, and a dropped object gained at most 50. In a museum, it lost 360 or more with each of 60 objects
+taken out. With a larger value, more logs take the time of the search."""
 
 
 def has_lasting_errors(state: JointState) -> bool:
@@ -62,21 +61,21 @@ def has_lasting_errors(state: JointState) -> bool:
 
 
 def begins_with_lasting_errors(state: JointState) -> bool:
-    """Return whether the odometry alone says that the localisation errs for seconds, before any ray has an object. False
-    objects hide such errors from a solve."""
+    """Return whether the odometry shows that the localisation errs for seconds, before any ray has an object. In a solve,
+    false objects hide such errors."""
     return has_lasting_errors(state) and state.errors is not None and max(lasting_long(state.errors.noise)) >= _LARGE
 
 
 def check_neighbours(
     solution: Solution, errors: SharedErrors | None, settings: Settings, earlier: tuple[float, float] | None = None
 ) -> Finding | None:
-    """Return a finding if a joint solve at a localisation that errs for seconds has equal things that it cannot tell apart.
+    """Return a finding if a localisation errs for seconds, and equal things are too near each other to be distinguished.
 
-    All rays of these seconds pass their things on the same side, so a ray to one thing may point at its neighbour. The solve
-    bends the path until such rays fit, so the residuals do not show it. The odometry may show it, or an earlier map at the
-    given poses. If only this map shows errors, false objects may hide them from the solve.
-    errors: of all frames, before the solve. earlier: the errors of headings, rad, and of places, m, that an earlier map at
-    the given poses showed.
+    During such errors, all rays pass their things on the same side, so a ray to one thing may point at its neighbour. A
+    joint solve bends the path until such rays fit, so the residuals do not show the error. The odometry may show it, or an
+    earlier map at the given poses. If only the earlier map shows errors, false objects may hide them from the solve. errors:
+    the shared errors with all frames, before the solve. earlier: the errors of headings, rad, and of places, m, that an
+    earlier map at the given poses showed.
     """
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     noise = estimate.noise or NoiseFactors()
@@ -85,7 +84,7 @@ def check_neighbours(
         return None
     said = np.array([settings.localization.yaw, settings.localization.xy])
     size = np.maximum(noise.lasting_factors, lasting_by_odometry(errors)) * said
-    if earlier is not None:  # They were a finding of the earlier map.
+    if earlier is not None:  # These errors were a finding of the earlier map.
         size = np.maximum(size, earlier)
     elif (size < _LARGE * said).all():
         return None
@@ -127,15 +126,16 @@ def check_neighbours(
 
 
 def without_phantoms(state: JointState) -> JointState:
-    """Return the state without objects that make the rays worse `explained`, else the state itself.
+    """Return the state without phantoms, or the state itself if there are none. Without its phantoms, the log is better
+    `explained`.
 
     If headings err for seconds, a ray to one thing passes its neighbours. Rays to several things then meet at points without
     a thing, and a solve bends the path until they agree. Each ray then fits, so no round of association frees it. Here each
     object is taken out of the map in turn. The most likely path without the object gives its rays to other objects. If this
     explains the log better, the object is a phantom. The phantom whose loss explains the log best is dropped, and the other
     phantoms are tried again. The shared errors and the noise are fixed in these trials. The first trial keeps all objects.
-    If its path is much worse, the path search is too coarse for the log (`_COARSE`), and nothing else is tried. If it is
-    better, the other trials begin there. After `joint.max_solves` solves, nothing else is tried, and the state is
+    If its result is much worse, the path search is too coarse for the log (`_COARSE`), and the search ends. If its result is
+    better, the other trials begin at this result. After `joint.max_solves` solves, the search ends, and the state is
     unfinished.
     """
     assert state.association is not None
@@ -175,7 +175,8 @@ def without_phantoms(state: JointState) -> JointState:
 
 
 def _candidates(state: JointState) -> Ints:
-    """Return the objects that may be phantoms, the least likely first. Only labels with several objects have any."""
+    """Return the objects that may be phantoms, with the least likely first. Only labels with several objects can have
+    phantoms."""
     association, estimate = state.association, state.estimate
     assert association is not None
     assert estimate is not None
@@ -188,8 +189,8 @@ def _candidates(state: JointState) -> Ints:
 
 
 def _without(state: JointState, j: int) -> JointState | None:
-    """Return the state after a solve without object `j`, with the rays along the most likely path. None without a path, or
-    if most rays of the object belong to no other (`_LOST`)."""
+    """Return the state after a solve without object `j`, with the objects of the rays along the most likely path. Return
+    None without a path, or if most rays of the object find no other object (`_LOST`)."""
     assert state.association is not None
     assert state.estimate is not None
     positions = state.estimate.positions.copy()
@@ -202,18 +203,20 @@ def _without(state: JointState, j: int) -> JointState | None:
 
 
 def _along_likely_path(state: JointState, estimate: Estimate) -> JointState | None:
-    """Return the state after a solve with the rays along the most likely path through the map `estimate`. None without a
-    path."""
+    """Return the state after a solve with the objects of the rays along the most likely path through the map `estimate`.
+    Return None without a path."""
     found = _relocalized(state, estimate)
     return None if found is None else _solved_along(state, *found)
 
 
 def _relocalized(state: JointState, estimate: Estimate) -> tuple[Floats, Association] | None:
-    """Return the most likely path through the map `estimate`, and the objects of the rays along it. None without a path."""
+    """Return the most likely path through the map `estimate`, and the objects of the rays along it. Return None without a
+    path."""
     assert state.association is not None
     return relocalize(state.keyframes, state.rays, state.cameras, state.settings, state.association, estimate)
 
 
 def _solved_along(state: JointState, path: Floats, association: Association) -> JointState:
-    """Return the state after a solve with these objects of the rays. path: (K, 4, 4) map_T_base, where it begins."""
+    """Return the state after a solve with the given objects of the rays. path: (K, 4, 4) map_T_base, where the solve
+    begins."""
     return state.counted(association).solve("association", association, path @ state.keyframes.base_T_camera)

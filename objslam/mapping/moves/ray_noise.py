@@ -16,18 +16,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RayNoise:
-    """The standard deviations of rays. angle: (R,) rad. place: m, of their origins, 0 at solved poses."""
+    """The standard deviations of R rays. angle: (R,) rad, of the directions. place: m, of the origins, 0 at solved poses."""
 
     angle: Floats
     place: float
 
     def at(self, distance: Floats, rays: Ints) -> Floats:
-        """Return the standard deviations (n,), rad, of some rays (n,) at things at a distance (n,), m, NaN if unknown."""
+        """Return the standard deviations (n,), rad, of some rays. rays: (n,) indices of rays. distance: (n,) m, to the thing
+        of each ray, NaN if unknown."""
         return np.hypot(self.angle[rays], np.nan_to_num(self.place / np.maximum(distance, 1e-9)))
 
 
 def noise_of_rays(keyframes: Keyframes, rays: Rays, settings: Settings) -> RayNoise:
-    """Return the noise of rays. At given poses, near things miss their rays by the noise of the poses too."""
+    """Return the noise of rays. In fixed mode, it includes the noise of the poses, which matters most for near things."""
     from objslam.graph.fixed_pose_triangulation import pose_noise
 
     return RayNoise(*(pose_noise(rays, keyframes, settings) if settings.mode == "fixed" else (rays.sigma, 0.0)))

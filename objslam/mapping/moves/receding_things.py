@@ -1,7 +1,6 @@
-"""Things that move along the view: their ranges follow a trend that no thing at rest has.
+"""Find things that move along the view. Their ranges follow a trend that no thing at rest has.
 
-A person who walks ahead of a robot stays near one direction, so the rays nearly meet in a point. Only the ranges grow.
-"""
+A person who walks ahead of a robot stays near one direction, so the rays nearly meet in a point. Only the ranges grow."""
 
 from __future__ import annotations
 
@@ -22,26 +21,28 @@ from objslam.mapping.moves.constant_velocity import FEWEST, Sights, Views, fit_p
 from objslam.mapping.moves.ray_noise import noise_of_rays
 
 _CLEAR = 20.0
-"""The least gain of a moving point over a point at rest, in -2 ln likelihood. It is also the least squared deviation of the
-velocity along the view from 0. By noise alone, 8e-6 of the views have such a velocity (chi-squared, 1 degree of freedom). In
-simulations, people had 32 to 160. Things seen in one visit had at most 5, and things seen in several visits at most 24. A
-larger value finds fewer moving things."""
+"""The least gain of a moving point over a point at rest, in -2 ln of the likelihood. It is also the least square of the
+velocity along the view over its variance. By noise alone, a share of 8e-6 of the views have such a velocity (chi-squared, 1
+degree of freedom). In simulations, people had 32 to 160. Things seen in one visit had at most 5, and things seen in several
+visits at most 24. With a larger value, fewer moving things are found."""
 _WITHIN = 0.75
-"""The share of its width by which a thing at rest may seem to move along the view. A range ends anywhere on a surface, so it
-changes with the side that is seen. People who walked for half a second had 1.0 and more. With 1, they became objects. A
-larger share finds fewer moving things."""
+"""The largest distance by which a thing at rest may seem to move along the view, as a share of its width. A range ends
+anywhere on a surface, so it changes with the side that is seen. People who walked for half a second had 1.0 and more. With a
+share of 1, these people became objects. With a larger share, fewer moving things are found."""
 _POSES = 4.2
-"""A thing at rest may seem to move by this number of standard deviations of the places of the robot. The difference of two
-places has sqrt(2) of one, and 3 standard deviations of it are 4.2. A larger number finds fewer moving things."""
+"""The largest distance by which a thing at rest may seem to move because the poses err, in standard deviations of the
+robot's places. The difference of two places has sqrt(2) times the standard deviation of one place, and 3 times that is 4.2.
+With a larger number, fewer moving things are found."""
 _MOST = 0.5
-"""A thing moves if more than this share of its rays are in views that move, in all and in each visit. A larger share finds
-fewer moving things."""
+"""The share of a thing's rays that must be in views that move, so that the thing moves. It must be exceeded among all its
+rays, and in each judged visit. With a larger share, fewer moving things are found."""
 _OWN = 2.0
-"""The noise of the label weighs as much as this number of ranges in the scatter of one view about its moving point. With a
-larger number, a view whose ranges jump to a background is more often said to move."""
+"""The weight of the label's noise in the scatter of one view about its moving point, as a number of ranges. With a larger
+number, a view whose ranges jump to a background more often seems to move."""
 _OTHERS = 2
-"""The fewest things of a label, each seen again at its place, that show how much things at rest of this label seem to move.
-One such thing may be a person who was there twice. With a larger number, fewer labels are known."""
+"""The fewest things of a label that show how much things at rest of this label seem to move. Each was seen again at its
+place. A single such thing may be a person who was there twice. With a larger number, fewer labels are judged by their own
+things."""
 _MEDIAN = 0.455  # The median of chi-squared with 1 degree of freedom.
 
 
@@ -54,13 +55,10 @@ def things_along_the_view(
     settings: Settings,
     cameras: Sequence[Camera],
 ) -> Bools:
-    """Return which objects (N,) are of things that move along the view, as their ranges show (`moving_along`).
+    """Return a mask (N,) of the objects whose ranges show that their things move along the view (`moving_along`).
 
-    Args:
-        keyframes, rays, association, estimate: of the map.
-        map_T_camera: (K, 4, 4).
-        settings: of the run.
-        cameras: of the log.
+    Args: keyframes, rays, association, estimate: of the map. map_T_camera: (K, 4, 4). settings: of the run. cameras: of the
+    log.
     """
     placed = np.append(np.isfinite(estimate.positions[:, 0]), False)  # The last entry is for rays without an object.
     held = np.flatnonzero((estimate.weight > 0) & placed[association.object])
@@ -86,7 +84,8 @@ def things_along_the_view(
 
 
 def moving_along(sights: Sights, place: float) -> tuple[Bools, Floats]:
-    """Return which things (N,) move along the view, and the longest way (N,), m, that each seems to move in one view.
+    """Return a mask (N,) of the things that move along the view, and the longest way (N,), m, that each thing seems to move
+    in one view.
 
     A view moves under two conditions. A point with a constant velocity explains its rays and ranges far better than a point
     at rest. This point moves along the view by more than the surface of a thing at rest can explain. A thing moves if most
@@ -123,10 +122,11 @@ def moving_along(sights: Sights, place: float) -> tuple[Bools, Floats]:
 
 
 def _usual(views: Views, clear: Floats) -> Floats:
-    """Return the factor (L,) >= 1 by which things at rest of each label seem to move more clearly than the noise says.
+    """Return the factors (L,), at least 1, by which things at rest of each label seem to move more clearly than noise
+    explains.
 
-    Things that are seen again at their place rest. A range to a sign that is seen from the side changes as the robot drives
-    past. clear: (V,) the squared deviation of the velocity along the view from 0.
+    A thing that is seen again at its place is at rest. Its ranges may change all the same, as those to a sign seen from the
+    side do while the robot drives past. clear: (V,) the square of the velocity along the view over its variance.
     """
     labels = int(views.label.max()) + 1
     judged, first = views.number >= FEWEST, np.unique(views.visit, return_index=True)[1]

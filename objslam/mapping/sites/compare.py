@@ -18,12 +18,13 @@ from objslam.mapping.sites.session import Session
 
 @dataclass(frozen=True)
 class Change:
-    """What became of one object.
+    """What became of one object between two maps.
 
-    outcome: as in `Life`, for these two maps alone: `confirmed` means that both have the object at one place. item: the
-    object as both maps together know it, in the frame of the first. Its `id` is of neither map. id_a, id_b: its id in the
-    first and in the second map, None if this map does not have it. probability: of the outcome. If the outcome is `gone`,
-    the object is gone with this probability. With any other outcome, it is where `item` is with this probability.
+    outcome: a state as in `Life`, for these two maps alone. For example, `confirmed` means that both maps have the object at
+    one place. item: the object as both maps together know it, in the frame of the first map. Its `id` is not an id of either
+    map. id_a, id_b: the object's id in the first and in the second map, None if the map does not have the object.
+    probability: the probability that the object is gone if the outcome is `gone`. With any other outcome, the probability
+    that the object is at the place of `item`.
     """
 
     outcome: Fate
@@ -37,10 +38,10 @@ class Change:
 class Comparison:
     """Two maps in the frame of the first.
 
-    registration: the match of the two maps. reason: why it was accepted or refused, in a few words. changes: one for each
-    object of both maps, empty if the registration was refused. a_T_b: (4, 4) takes points from the second frame to the
-    first. has_views: whether the first and the second map say what was in view. If the second map does not say it, no object
-    counts as gone. If the first map does not say it, each object that only the second map has counts as new.
+    registration: the match of the two maps. reason: why the registration was accepted or refused, in a few words. changes:
+    one for each object of both maps, empty if the registration was refused. a_T_b: (4, 4) takes points from the second frame
+    to the first. has_views: whether the first and the second map say what was in view. If the second map does not, no object
+    counts as gone. If the first map does not, each object that only the second map has counts as new.
     """
 
     registration: Registration
@@ -69,7 +70,7 @@ def compare(a: Session, b: Session) -> Comparison:
 
 
 def _changes(a: Session, b: Session, island: Island) -> list[Change]:
-    """Return the change of each object of both maps. What was gone in a map already is not in it."""
+    """Return the change of each object of both maps. An object that was already gone in a map counts as not in that map."""
     items = (*island.objects, *island.objects.gone)
     positions = np.array([o.position for o in items]).reshape(-1, 3)
     before = there_before(a, items, positions, np.eye(4), np.full(len(items), UNPROVEN))

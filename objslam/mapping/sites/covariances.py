@@ -1,4 +1,4 @@
-"""The covariances of objects in a merge of sessions: what a session measures, and what its site then knows."""
+"""The covariances of objects in a merge of sessions: those of each session's measurements, and those of the site."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,13 +13,14 @@ from objslam.core.object_map import MapObject
 Row = tuple[int, int, MapObject]
 """One object of one session: the number of the session, the number of its track, and the object."""
 _REMEMBERED = 5
-"""In a solve, an object of a site weighs as much as its number of sessions, up to this number. With a larger number, its
-position averages more sessions, and follows a nudged object more slowly."""
+"""The largest weight of an object of a site in a solve, as a number of sessions. The weight is the number of sessions that
+saw the object, up to this limit. With a larger number, the position averages more sessions, and follows a nudged object more
+slowly."""
 
 
 def measured_objects(rows: list[Row], shared: Sequence[Floats | None]) -> Measured:
-    """Return the objects of S sessions as measurements of their tracks. shared: the covariance (7, 7) of the shared error of
-    each session, None if it is not known."""
+    """Return the objects of S sessions as measurements of their tracks. shared: for each session, the covariance (7, 7) of
+    the error that its objects share, None if it is not known."""
     maps, objects = (np.array([row[n] for row in rows], dtype=np.int64) for n in (0, 1))
     positions = np.array([o.position for _, _, o in rows]).reshape(-1, 3)
     roots = np.array([np.zeros((NUMBERS, NUMBERS)) if one is None else root_of(one) for one in shared])
@@ -32,9 +33,9 @@ def measured_objects(rows: list[Row], shared: Sequence[Floats | None]) -> Measur
 def site_covariances(solved: JointFrames, rows: list[Row], shared: Sequence[Floats | None]) -> tuple[Floats, Floats]:
     """Return the covariances (N, 3, 3) m^2 of the tracks, and their correlated part as a factor (N, 3, m) m.
 
-    Some errors repeat from session to session: the errors of an object's boxes, and the scale of a robot's odometry. Many
-    sessions do not average them out. So the own error of an object is at least its error in the best session. The size of
-    the site is at least as uncertain as in the best session.
+    Some errors repeat from session to session, such as the errors of an object's boxes and the scale of a robot's odometry.
+    Many sessions do not average these errors out. So the own error of an object is at least its own error in its best
+    session. The size of the site is at least as uncertain as the size of the best session.
     """
     measured = measured_objects([(s, k, replace(o, life=None)) for s, k, o in rows], shared)
     assert measured.roots is not None

@@ -1,4 +1,4 @@
-"""The life of each object of a site: what became of it, updated session after session (`Life`)."""
+"""Update the life of each object of a site, session after session. A `Life` says what became of an object."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from objslam.core.object_map import Fate, Life, MapObject
 from objslam.mapping.sites.session import Session
 
 GONE = 0.5
-"""The probability below which an object counts as gone. A larger value gives objects up sooner."""
+"""The probability of existence below which an object counts as gone. With a larger value, objects count as gone sooner."""
 FORGOTTEN = 0.01
-"""The probability below which a site forgets an object that is gone. A larger value forgets sooner."""
+"""The probability of existence below which a site forgets an object that is gone. With a larger value, it forgets sooner."""
 UNPROVEN = 0.9
-"""After one session found an object, the probability that it exists is at most this. If the session gives no probability, it
-is this value. A larger value trusts single sessions more."""
+"""The largest probability of existence of an object that one session found. If the session gives no probability, this value
+is used. A larger value trusts single sessions more."""
 _DAY = 86_400.0  # The seconds of a day.
 _ALIKE = 2.0
 """The largest ratio of the sizes of an object before and after it moved. With a larger value, more pairs count as one
@@ -29,10 +29,10 @@ object."""
 class Track:
     """One object over the sessions of a site.
 
-    item: the object as seen last. number: its id in the site, None for a new object. life: the life after the sessions so
-    far, None before the first session. places: its measurements, as rows of the joint solve. begun, met: the first and the
-    last session that found it, as indices in the order of time. since: when it was seen first, s. was: the track of the same
-    object at its earlier place, None if it did not move.
+    item: the object as seen last. number: the object's id in the site, None for a new object. life: the life after the
+    sessions so far, None before the first session. places: the object's measurements, as rows of the joint solve. begun,
+    met: the first and the last session that found the object, as indices in the order of time. since: the time (s) when the
+    object was first seen. was: the track of the same object at its earlier place, None if it did not move.
     """
 
     item: MapObject
@@ -46,11 +46,11 @@ class Track:
 
 
 def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[MapObject | None], when: float) -> list[Life]:
-    """Return the lives (N) of the tracks after one session.
+    """Return the life of each of N tracks after one session.
 
     found: (N,) whether the session found each object. looks: (N,) in how many frames of the session each should have been
-    detected. seen: each object as the session has it, None if not found. when: the time of the session, s. A track without a
-    life gets its first one.
+    detected. seen: each object as the session has it, None if the session did not find it. when: the time of the session, s.
+    A track without a life gets its first one.
     """
     old = [t.life for t in tracks]
     before = np.array([UNPROVEN if life is None else life.probability for life in old])
@@ -89,8 +89,9 @@ def there_before(
 ) -> Floats:
     """Return the probability (N,) that each object was already there in an earlier session that did not find it.
 
-    It is 0 if the session does not say what was in view. Below `GONE`, the object counts as new. positions: (N, 3) m, in the
-    site. session_T_site: (4, 4). before: (N,) this probability from the sessions treated so far, `UNPROVEN` at first.
+    The probability is 0 if the session does not say what was in view. With a probability below `GONE`, the object counts as
+    new. positions: (N, 3) m, in the frame of the site. session_T_site: (4, 4). before: (N,) the same probability after the
+    sessions treated so far, `UNPROVEN` at first.
     """
     visits = session.visits() if session.views is None else ()
     parts = [(one.session, one.session_T_site @ session_T_site) for one in visits] or [(session, session_T_site)]

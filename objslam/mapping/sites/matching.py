@@ -9,10 +9,10 @@ from objslam.core.object_map import MapObject
 from objslam.core.statistics import SAME_POINT
 
 STILL = 0.05
-"""The standard deviation (m) of the shift between sessions of an object that stayed: somebody nudges it, or its boxes
-differ. With a larger value, more shifted objects count as unmoved."""
+"""The standard deviation (m) by which the position of an object that stayed differs between sessions. Somebody nudges the
+object, or its boxes differ. With a larger value, more shifted objects count as unmoved."""
 _MISLABELLED = 0.02
-"""The probability that a detector gives an object one particular wrong label. With a larger value, objects with different
+"""The probability that a detector gives an object a particular wrong label. With a larger value, objects with different
 labels match over a larger distance."""
 
 
@@ -21,9 +21,9 @@ def same_objects(
 ) -> Ints:
     """Return the pairs (P, 2) of indices into `ours` and `theirs` that are one object. The matching is one-to-one.
 
-    It has the largest sum of gains. The gain of a pair is `SAME_POINT` minus its cost, and is positive. The cost is the
-    squared Mahalanobis distance, minus 2 ln of `label_agreement`. positions, covariance: (N, 3) m and (N, 3, 3) m^2 of
-    `ours`. other, other_cov: (M, 3) m and (M, 3, 3) m^2 of `theirs`, in the same frame.
+    The matching has the largest sum of gains. The gain of a pair is `SAME_POINT` minus the cost of the pair, and must be
+    positive. The cost is the squared Mahalanobis distance, minus 2 ln of `label_agreement`. positions, covariance: (N, 3) m
+    and (N, 3, 3) m^2 of `ours`. other, other_cov: (M, 3) m and (M, 3, 3) m^2 of `theirs`, in the same frame.
     """
     if not len(ours) or not len(theirs):
         return np.zeros((0, 2), dtype=np.int64)
@@ -42,7 +42,8 @@ def same_objects(
 
 
 def label_agreement(a: MapObject, b: MapObject) -> float:
-    """Return the probability that both objects have one label, by their label shares. It is at least `_MISLABELLED`."""
+    """Return the probability that both objects have the same label, from their label shares. It is at least
+    `_MISLABELLED`."""
     shares = [o.labels or {o.label: 1.0} for o in (a, b)]
     both = sum(share * shares[1].get(name, 0.0) for name, share in shares[0].items())
     return max(min(both, 1.0), _MISLABELLED)

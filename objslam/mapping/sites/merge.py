@@ -1,8 +1,7 @@
-"""Join many sessions, each in a frame of its own, to one map of the site.
+"""Join many sessions to one map of the site. Each session has a frame of its own.
 
 An island is a group of sessions that share objects. A track is one object over the sessions of an island. The life of an
-object says what became of it (`Life`).
-"""
+object says what became of it (`Life`)."""
 
 from __future__ import annotations
 
@@ -34,8 +33,8 @@ from objslam.mapping.sites.placement import Part, mean_labels, place_sessions, s
 from objslam.mapping.sites.session import Session
 
 _YOUNG = 2
-"""An object that at most this number of sessions saw may have moved to its place. A larger number finds more moves, and
-takes more added objects for moved objects."""
+"""The largest number of sessions that saw an object which may have moved to its place. With a larger number, more moves are
+found, and more added objects count as moved."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +42,10 @@ class Island:
     """S sessions that share objects, as one map in the frame of the first session.
 
     objects: the map, with the life of each object. sessions: the indices of the sessions, in the order of time.
-    site_T_session: (S, 4, 4). covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each session, 0 for the first. log_odds:
-    (S,) the log odds of the registration that tied each session to the others, NaN for the first. common: for each session,
-    how many of its objects another session found too. found_as: for each object id, the sessions that found it, and its id
-    in each. moved_as: the same for the earlier place of an object that moved, only for objects that moved between these
+    site_T_session: (S, 4, 4). covariance: (S, 4, 4) the covariance of x, y, z (m) and yaw (rad) of each session's frame, 0
+    for the first. log_odds: (S,) the log odds of the registration that joined each session to the others, NaN for the first.
+    common: for each session, the number of its objects that another session found too. found_as: for each object id, the
+    object's id in each session that found it. moved_as: the same for the earlier place of an object that moved between these
     sessions.
     """
 
@@ -64,8 +63,8 @@ def merge_sessions(sessions: Sequence[Session]) -> tuple[Island, ...]:
     """Join each group of sessions that share objects to one island. The largest island comes first.
 
     sessions: in the order of time. The first session of an island gives its frame. A session that fits no other session is
-    an island of its own. If a session is a whole site, its objects bring their lives along. Its own sessions (`visits`) are
-    read only for the objects that it lacks.
+    an island of its own. If a session is a whole site, its objects keep their lives. The sessions of this site (`visits`)
+    are read only for the objects that the site lacks.
     """
     islands = [_island(sessions, part) for part in place_sessions(sessions)]
     return tuple(sorted(islands, key=lambda one: (-len(one.sessions), one.sessions)))
@@ -75,7 +74,7 @@ def _island(sessions: Sequence[Session], part: Part) -> Island:
     """Return the sessions of a part as one map: their joint solve, and the life of each object."""
     order = sorted(part.site_T_session)
     turn = {s: number for number, s in enumerate(order)}
-    # Each measurement: its session, its track, its object. The tracks are in the order in which the sessions found them.
+    # A row is one measurement: session, track and object. The tracks are in the order in which the sessions found them.
     begun = sorted(part.tracks, key=lambda seen: min((turn[s], o.id) for s, o in seen))
     rows: list[Row] = sorted(
         ((turn[s], at, o) for at, seen in enumerate(begun) for s, o in seen), key=lambda row: (row[0], row[1])
@@ -111,7 +110,7 @@ def _live(
     rows: list[Row],
     solved: JointFrames,
 ) -> list[int]:
-    """Update the lives of the tracks, session by session in the order of time. Return the tracks left after `_follow`."""
+    """Update the lives of the tracks, session after session in the order of time. Return the tracks that `_follow` left."""
     begun: list[int] = []
     found: list[dict[int, MapObject]] = [{} for _ in order]
     for number, at, item in rows:
@@ -145,9 +144,9 @@ def _live(
 def _name_new(
     sessions: Sequence[Session], order: list[int], tracks: list[Track], positions: Floats, site_T_session: Floats
 ) -> None:
-    """Call an unconfirmed object `new` if an earlier session would have found it there.
+    """Set the state of an unconfirmed object to `new` if an earlier session would have found the object at its place.
 
-    positions: (N, 3) m, of the tracks.
+    positions: (N, 3) m, of the tracks, in the frame of the site.
     """
     alone = [k for k, t in enumerate(tracks) if t.begun and t.life is not None and t.life.state == "unconfirmed"]
     probability = np.full(len(tracks), UNPROVEN)
@@ -173,7 +172,8 @@ def _join_lives(tracks: list[Track], begun: list[int], here: dict[int, MapObject
 def _visit(
     tracks: list[Track], some: list[int], here: dict[int, MapObject], session: Session, positions: Floats, back: Floats
 ) -> None:
-    """Update the lives of some tracks with a session. here: the objects that it found, by track. back: session_T_site."""
+    """Update the lives of some tracks with a session. here: the objects that the session found, by track. back: (4, 4)
+    session_T_site."""
     looks = session.looks(tuple(tracks[at].item for at in some), positions[some], back)
     found = np.array([at in here for at in some], dtype=bool)
     lives = after_session([tracks[at] for at in some], found, looks, [here.get(at) for at in some], session.when)
@@ -182,7 +182,8 @@ def _visit(
 
 
 def _in_site(item: MapObject, before: MapObject | None, site_T_session: Floats) -> MapObject:
-    """Return an object of a session for the site, with the sides from which this session or an earlier one saw it.
+    """Return an object of a session for the site. Its `seen_from` has the sides from which this session or an earlier one
+    saw it.
 
     before: the object after the earlier sessions, None if they did not see it.
     """
@@ -196,11 +197,11 @@ def _in_site(item: MapObject, before: MapObject | None, site_T_session: Floats) 
 
 
 def _follow(tracks: list[Track], begun: list[int], positions: Floats, came: Sequence[int]) -> list[int]:
-    """Find objects that moved: one track is gone, and a similar track is new elsewhere. Return the tracks without these gone
-    tracks.
+    """Find objects that moved, and return the tracks without those of their earlier places.
 
-    The new track takes the number of the gone track. begun: the tracks so far. came: the tracks that a later site brought.
-    They count as new, however many sessions of that site saw them.
+    An object moved if its track is gone, and a similar track is new at another place. The new track takes the number of the
+    gone track. begun: the tracks so far. came: the tracks that a later site brought. They count as new, however many
+    sessions of that site saw them.
     """
     lives = {at: life for at in begun if (life := tracks[at].life) is not None}
     old = [at for at, life in lives.items() if life.state == "gone"]
@@ -268,7 +269,8 @@ def _objects(
 
 
 def _surest_body(solved: JointFrames, of: list[Row]) -> Body | None:
-    """Return the body whose size has the smallest noise, with its yaw in the frame of the site. None without any body."""
+    """Return the body whose size has the smallest noise, with its yaw in the frame of the site. Return None if there is no
+    body."""
     best: Body | None = None
     for n, _, o in of:
         if o.body is not None:
@@ -277,6 +279,7 @@ def _surest_body(solved: JointFrames, of: list[Row]) -> Body | None:
 
 
 def _best_tag(solved: JointFrames, of: list[Row]) -> TagPose | None:
-    """Return the rotation and size of a fiducial from the session with the surest rotation. None for other objects."""
+    """Return the rotation and size of a fiducial, from the session with the surest rotation. Return None for other
+    objects."""
     best = min(((o.tag.sigma_deg, n, o.tag) for n, _, o in of if o.tag is not None), key=lambda one: one[:2], default=None)
     return None if best is None else best[2].turned(solved.site_T_map[best[1], :3, :3])

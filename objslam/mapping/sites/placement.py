@@ -1,11 +1,9 @@
-"""Place the frames of many sessions: which sessions share objects, the transforms between them, and which
-objects are the same.
+"""Find which sessions share objects, the transforms between these sessions, and which objects are the same.
 
-A session is registered to the map of all sessions that are placed so far, not to each of these sessions. So a session costs
-one registration, however many sessions there are. The map also gives more evidence: it has more objects than any single
-session, and the label that most sessions gave to an object. What this module finds is a start: one joint solve of all
-sessions follows.
-"""
+A session is registered to the map of all sessions placed so far, not to each single session. So a session takes one
+registration, also among many sessions. The map also gives more evidence than a single session. It has more objects, and each
+object has the label that most sessions gave it. The transforms are only a start, because a joint solve of all sessions
+follows."""
 
 from __future__ import annotations
 
@@ -24,17 +22,17 @@ from objslam.mapping.sites.matching import same_objects
 from objslam.mapping.sites.session import Session
 
 Seen = tuple[int, MapObject]
-"""An object as one session has it: the index of the session, and the object."""
+"""The index of a session, and an object as this session has it."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Sessions that share objects, as one map.
+    """One map of sessions that share objects.
 
     objects: the map, in the frame of one of the sessions. It has the objects of `tracks`, in the same order: first all
-    objects that are present in a session, then the gone objects. tracks: each object as its sessions have it.
-    site_T_session: how each session lies in this frame. log_odds: the log odds of the registration that tied each session to
-    the others, NaN for the session that gives the frame.
+    objects that are present in a session, then the gone objects. tracks: each object as each of its sessions has it.
+    site_T_session: (4, 4) for each session, takes points from the session to the frame of the map. log_odds: the log odds of
+    the registration that joined each session to the others. It is NaN for the session that gives the frame.
     """
 
     objects: ObjectMap
@@ -46,7 +44,8 @@ class Part:
 def place_sessions(sessions: Sequence[Session]) -> list[Part]:
     """Return the groups of sessions that share objects. The maps of two groups cannot be registered to each other.
 
-    The sessions with the most objects come first. So the result does not depend on the order in which they are given.
+    The sessions with the most objects are placed first. So the result does not depend on the order in which sessions are
+    given.
     """
     order = sorted(
         range(len(sessions)), key=lambda s: (-len(placed(sessions[s].objects)), sessions[s].when, sessions[s].name)
@@ -57,7 +56,7 @@ def place_sessions(sessions: Sequence[Session]) -> list[Part]:
         while k < len(parts):
             found = register(new.objects, parts[k].objects)
             if found.accepted:
-                new, k = _joined(parts.pop(k), new, found.b_T_a, found.log_odds), 0  # It grew, so others may match now.
+                new, k = _joined(parts.pop(k), new, found.b_T_a, found.log_odds), 0  # It grew, so other parts may match now.
             else:
                 k += 1
         parts = sorted([*parts, new], key=lambda one: -len(one.site_T_session))
@@ -65,7 +64,8 @@ def place_sessions(sessions: Sequence[Session]) -> list[Part]:
 
 
 def _alone(number: int, objects: ObjectMap) -> Part:
-    """Return a session as a part. Gone objects may come back, so they can be matched. A registration does not use them."""
+    """Return a session as a part. Gone objects may come back, so they are kept and can be matched. A registration does not
+    use them."""
     kept = [
         tuple(o for o in some if o.status == "ok" and o.covariance is not None) for some in (objects.objects, objects.gone)
     ]
@@ -74,7 +74,8 @@ def _alone(number: int, objects: ObjectMap) -> Part:
 
 
 def _joined(a: Part, b: Part, a_T_b: Floats, log_odds: float) -> Part:
-    """Return two parts as one, in the frame of `a`. a_T_b: (4, 4) the frame of `b` there, from a registration."""
+    """Return two parts as one, in the frame of `a`. a_T_b: (4, 4) takes points from the frame of `b` to that of `a`, from a
+    registration."""
     ours, theirs = ([*one.objects.objects, *one.objects.gone] for one in (a, b))
     match = dict(_pairs(ours, theirs, a_T_b))
     track, count = [], len(ours)
@@ -110,7 +111,8 @@ def _joined(a: Part, b: Part, a_T_b: Floats, log_odds: float) -> Part:
 
 
 def _pairs(ours: list[MapObject], theirs: list[MapObject], a_T_b: Floats) -> list[tuple[int, int]]:
-    """Return pairs of indices into `theirs` and `ours` that are one object. a_T_b: (4, 4) takes `theirs` to `ours`."""
+    """Return pairs of indices into `theirs` and `ours` that are one object. a_T_b: (4, 4) takes points from the frame of
+    `theirs` to that of `ours`."""
     a, b = (ObjectMap(tuple(some)) for some in (ours, theirs))
     turn = a_T_b[:3, :3]
     positions, spread = b.positions @ turn.T + a_T_b[:3, 3], turn @ b.covariances @ turn.T
@@ -118,19 +120,20 @@ def _pairs(ours: list[MapObject], theirs: list[MapObject], a_T_b: Floats) -> lis
 
 
 def _with_labels_of(ours: MapObject, theirs: MapObject, often: Sequence[int]) -> MapObject:
-    """Return `ours` with the mean label shares of both, and the label that follows from these shares. often: how many
-    sessions saw each."""
+    """Return `ours` with the mean label shares of both objects, and the label with the largest share. often: the number of
+    sessions that saw each object."""
     shares = mean_labels([ours, theirs], often)
     return ours if shares is None else replace(ours, labels=shares, label=next(iter(shares)))
 
 
 def sessions_behind(item: MapObject) -> int:
-    """Return how many sessions an object stands for: 1, or for an object of a site the number of sessions that saw it."""
+    """Return the number of sessions that saw an object. It is 1 for an object of a drive."""
     return 1 if item.life is None else item.life.sessions_seen
 
 
 def mean_labels(items: Sequence[MapObject], often: Sequence[int]) -> dict[str, float] | None:
-    """Return the mean share of each label over an object's sessions, the largest first. None if a session has no shares.
+    """Return the mean share of each label over an object's sessions, with the largest first. Return None if a session has no
+    shares.
 
     often: the weight of each session's shares.
     """

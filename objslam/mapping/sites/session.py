@@ -1,4 +1,4 @@
-"""One session of a site: its map, and what its cameras could have seen."""
+"""One session of a site: its map, and what its cameras had in view."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ from objslam.io.results.read import load_map, load_rays, load_up, load_views
 from objslam.io.views_parquet import Views
 
 _SAME_FRAME = 0.005
-"""The longest time (s) between the stamps of a ray and of its camera frame. A larger value also matches inexact stamps, and
-may take the wrong frame of a fast camera."""
+"""The longest time (s) between the stamp of a ray and the stamp of its camera frame. A larger value also matches inexact
+stamps, but may match the wrong frame of a fast camera."""
 
 
 @dataclass(frozen=True)
 class Session:
-    """A map in a frame of its own: of one drive, or of a whole site.
+    """A map of one drive or of a whole site, in a frame of its own.
 
-    name: as shown in messages. views, rays: the camera frames and the rays of the drive. They are None for a map without a
-    result folder, which cannot say what was in view. visits: a function that returns the sessions of a site, in the order of
-    time. If it returns none, no session of the site counts as a miss. up: the axis of the map that points up.
+    name: the name in messages. objects: the map. views, rays: the camera frames and the rays of the drive. They are None for
+    a map without a result folder, because such a map does not say what was in view. visits: a function that returns the
+    sessions of a site, in the order of time. If it returns no session, the site cannot say that it missed an object. up: the
+    axis of the map that points up.
     """
 
     name: str
@@ -52,16 +53,17 @@ class Session:
 
     @property
     def when(self) -> float:
-        """The time of the session, s: the last update of a site, or the last time at which a drive saw an object."""
+        """The time (s) of the session. It is the last update of a site, or the last time at which a drive saw an object."""
         lives = [o.life.updated for o in (*self.objects, *self.objects.gone) if o.life is not None]
         seen = lives or [o.last_seen for o in self.objects if np.isfinite(o.last_seen)]
         return max(seen, default=0.0)
 
     def looks(self, objects: tuple[MapObject, ...], positions: Floats, session_T_map: Floats) -> Ints:
-        """Return in how many frames (N,) each object should have been detected if it was at positions (N, 3), m.
+        """Return the number of frames (N,) in which each object should have been detected if it was at its position.
+        positions: (N, 3) m.
 
         session_T_map: (4, 4) takes points from the frame of the objects and positions to the frame of this session. The
-        result is 0 for an object without `seen_from`, and for all objects if the session has no views.
+        number is 0 for an object without `seen_from`. It is 0 for all objects if the session has no views.
         """
         looks = np.zeros(len(objects), dtype=np.int64)
         known = np.array([o.seen_from is not None for o in objects], dtype=bool)
@@ -83,15 +85,15 @@ class Session:
 
 @dataclass(frozen=True)
 class Visit:
-    """A session of a site. session_T_site: (4, 4), takes points from the frame of the site to the frame of the session."""
+    """A session of a site. session_T_site: (4, 4) takes points from the frame of the site to the frame of the session."""
 
     session: Session
     session_T_site: Floats
 
 
 def _boxes(rays: RaysTable, objects: ObjectMap, views: Views) -> tuple[Observations, Floats]:
-    """Return the boxes of all frames, in the order of the frames. Also return the distance (R,) m of the object of each box,
-    NaN if unknown.
+    """Return the boxes of all frames, in the order of the frames. Also return the distance (R,) in m from the camera to the
+    object of each box, NaN if unknown.
 
     Boxes without a camera frame are left out.
     """

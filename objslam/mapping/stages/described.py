@@ -1,4 +1,4 @@
-"""The late stages of a run: add bodies and wider covariances to the solution, describe its objects, and check the map."""
+"""The late stages of a run: add bodies and wider covariances to the solution, describe the objects, and check the map."""
 
 from dataclasses import dataclass, replace
 
@@ -31,10 +31,10 @@ from objslam.mapping.stages.solved import SolvedDrive
 class DescribedDrive:
     """A solved drive and the map of its objects.
 
-    residual: (R,) rad, the angle between each ray and its object, NaN without an object. trusted: whether the input, before
-    the checks of the map, lets positions count. lasting: the errors of given poses that last for seconds, None if the solve
-    had no given poses or shows none. late, noisy: the findings that given poses err for seconds, or by more than their
-    settings say. None if they do not.
+    residual: (R,) rad, the angle between each ray and its object, NaN without an object. trusted: whether the checks of the
+    input found positions reliable. lasting: the errors of given poses that last for seconds. It is None if the poses were
+    solved, or if the map does not show such errors. late: the finding that given poses err for seconds, if any. noisy: the
+    finding that they err by more than the settings say, if any.
     """
 
     found: SolvedDrive
@@ -60,8 +60,7 @@ def mapped(found: SolvedDrive, earlier: MapAtPoses | None, ledger: Ledger, *, le
 def _completed(found: SolvedDrive, *, level: bool) -> tuple[SolvedDrive, LastingNoise | None]:
     """Return the drive with the bodies of its objects, and with the covariances that solves do not contain.
 
-    level: whether the path of a joint solve is turned until it is level. The second value is the size of the errors of given
-    poses that last for seconds, as in `DescribedDrive`.
+    level: whether the path of a joint solve is turned until it is level. The second value is `lasting` of `DescribedDrive`.
     """
     drive, solution, lasting = found.drive, found.solution, None
     cameras, settings = drive.cameras, drive.settings
@@ -84,7 +83,7 @@ def _described(
 ) -> DescribedDrive:
     """Return the map of a completed drive, with the findings of the checks of the map. The ledger warns of them.
 
-    lasting: from `_completed`. earlier: the map at the given poses, if this solve follows it.
+    lasting: from `_completed`. earlier: the map at the given poses, if this is a second solve, else None.
     """
     drive = found.drive
     trusted = not drive.diagnosis.spoilt
@@ -96,7 +95,7 @@ def _described(
 
 
 def _with_checked_rays(of: DescribedDrive, ledger: Ledger) -> DescribedDrive:
-    """Return a map whose covariances contain what single rays and small errors show."""
+    """Return a map whose covariances contain the errors that single rays, ranges and the findings about the input show."""
     drive, solution, objects = of.found.drive, of.found.solution, of.objects
     used, estimate = (solution.keyframes, solution.rays, solution.association), solution.estimate
     map_T_camera = estimate.map_T_base @ solution.keyframes.base_T_camera
@@ -109,7 +108,7 @@ def _with_checked_rays(of: DescribedDrive, ledger: Ledger) -> DescribedDrive:
 
 
 def _with_checked_poses(of: DescribedDrive, ledger: Ledger) -> DescribedDrive:
-    """Return a map at given poses with what its residuals show of the poses."""
+    """Return a map at given poses with the findings about these poses that its residuals show."""
     drive, solution = of.found.drive, of.found.solution
     keyframes, settings = solution.keyframes, drive.settings
     explained = any(one.spoils or one.name != JUMPS for one in drive.diagnosis.findings)
@@ -124,7 +123,7 @@ def _with_checked_poses(of: DescribedDrive, ledger: Ledger) -> DescribedDrive:
 
 
 def _with_checked_path(of: DescribedDrive, earlier: MapAtPoses | None, ledger: Ledger) -> DescribedDrive:
-    """Return a map of a joint solve with what it shows of its path and of its objects."""
+    """Return a map of a joint solve with the findings about its path and its objects that it shows."""
     drive, solution, before = of.found.drive, of.found.solution, of.found.before
     told = None if earlier is None or earlier.lasting is None else (earlier.lasting.yaw, earlier.lasting.xy)
     drive = drive.with_finding(check_neighbours(solution, before, drive.settings, told), ledger)

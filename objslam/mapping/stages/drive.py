@@ -1,4 +1,4 @@
-"""What the stages of a run know of its log: the log itself, the settings, and the findings so far."""
+"""What the stages of a run know about its log: the log itself, the settings, and the findings so far."""
 
 from dataclasses import dataclass, replace
 from typing import Self
@@ -21,10 +21,10 @@ from objslam.mapping.chosen_poses import with_chosen_poses, with_mode_of
 class Drive:
     """A log as a run maps it.
 
-    log: without the errors that are known or solved. given: with these errors, at the chosen poses, and without boxes that
-    show no thing of their own. settings: with the mode that `auto` means for this log. diagnosis: the findings so far.
-    detections, frames: the numbers of recorded boxes and frames. chosen: whether `auto` chose the mode. clock: the clock of
-    the odometry, None if it is that of the localisation.
+    log: the log without the errors that are known or solved. given: the log with these errors, at the chosen poses. It lacks
+    boxes on parts of the robot, and second boxes on one thing. settings: the settings, with the mode that `auto` means for
+    this log. diagnosis: the findings so far. detections, frames: the numbers of recorded boxes and frames. chosen: whether
+    `auto` chose the mode. clock: the clock of the odometry, None if it is the clock of the localisation.
     """
 
     log: Log
@@ -38,7 +38,7 @@ class Drive:
 
     @classmethod
     def of(cls, log: Log, settings: Settings, ledger: Ledger) -> Self:
-        """Return a log at its chosen poses, not checked yet. The ledger counts what is left out.
+        """Return the drive of a log at its chosen poses, before any check. The ledger counts what is left out.
 
         LogError if the log lacks the chosen poses. ConfigError if calibration.file is wrong or does not fit the log.
         """
@@ -59,7 +59,7 @@ class Drive:
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """The cameras of the log, in its order."""
+        """The cameras, in the order of the log."""
         return tuple(one.camera for one in self.log.cameras)
 
     @property

@@ -23,8 +23,8 @@ from objslam.mapping.stages.drive import Drive
 def checked(drive: Drive, ledger: Ledger, progress: Progress) -> Drive:
     """Return the drive with the findings about its input, and with the noise that its boxes show.
 
-    The localisation has no jumps any more. The poses of certainly wrong input are not solved. The ledger warns of findings,
-    unless a solve may refute them. LogError if stamps are not in s, or boxes not in px.
+    Jumps of the localisation are taken out of the log. If the input is certainly wrong, the mode becomes `fixed`. The ledger
+    warns of findings, unless a solve may refute them. LogError if stamps are not in s, or boxes not in px.
     """
     expected = take_out_expected(drive.given, drive.settings)
     settings = with_uneven_ground(expected, drive.settings, ledger, progress)
@@ -44,7 +44,8 @@ def checked(drive: Drive, ledger: Ledger, progress: Progress) -> Drive:
 def measured(drive: Drive, ledger: Ledger) -> tuple[Drive, Keyframes, Rays]:
     """Return the drive, its keyframes and its rays. In joint mode, the odometry continues the localisation of the drive.
 
-    The ledger counts what gives no ray. LogError if no frame lies on the path. SolveError if no box gives a usable ray.
+    The ledger counts the boxes that give no ray. LogError if no frame lies on the path. SolveError if no box gives a usable
+    ray.
     """
     localized, log, settings = drive.log, drive.log, drive.settings
     if drive.joint:

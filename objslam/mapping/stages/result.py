@@ -22,9 +22,9 @@ from objslam.mapping.views import solved_views
 
 
 def in_known_map(of: DescribedDrive, known: PriorMap, ledger: Ledger) -> tuple[DescribedDrive, Localization]:
-    """Return the drive in the frame of an older map, if it is found there.
+    """Return the drive in the frame of an older map, if the drive is found in this map.
 
-    Otherwise it stays in its own frame, and the ledger warns of the reason.
+    Otherwise the drive stays in its own frame, and the ledger gets a warning with the reason.
     """
     found, drive = of.found, of.found.drive
     where = localize(found.solution, of.objects, known, found.errors, drive.settings, ledger)
@@ -37,7 +37,7 @@ def in_known_map(of: DescribedDrive, known: PriorMap, ledger: Ledger) -> tuple[D
 
 
 def in_map(where: Localization | None) -> dict[str, Any]:
-    """Return what a summary says of the place of a drive in an older map. where: None if there is no such map."""
+    """Return the entries of the summary about the place of a drive in an older map. where: None if there is no such map."""
     if where is None:
         return {}
     return {"localisation": where.told, **({} if where.solution is None else {"map_frame": "map"})}
@@ -53,8 +53,8 @@ def result_of(
 ) -> RunResult:
     """Return the result of a described drive.
 
-    where: its place in an older map, None if there is no such map. frames: all frames on the path. seconds: of the stages so
-    far. The reconstruction, if any, adds its own.
+    where: the place of the drive in an older map, None if there is no such map. frames: all frames on the path. seconds: the
+    times (s) of the stages so far. The reconstruction, if any, adds its time.
     """
     drive, solution, errors = of.found.drive, of.found.solution, of.found.errors
     log, settings, given = drive.log, drive.settings, drive.given
@@ -102,7 +102,8 @@ def _surfaces(
     ledger: Ledger,
     progress: Progress,
 ) -> tuple[Surface | None, Surface | None]:
-    """Return the surfaces at the solved path and, if the settings ask for it, at the given one. None without depth."""
+    """Return the surface at the solved path, and the surface at the given path if the settings ask for it. A surface that is
+    not made is None."""
     if not settings.reconstruction.use or all(c.depth is None for c in log.cameras):
         return None, None
     from objslam.mapping.reconstruction import reconstruct  # Few logs have depth images.
@@ -115,7 +116,7 @@ def _surfaces(
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:
-    """Return the path through the solved poses (K, 4, 4). In joint mode it follows the odometry between keyframes."""
+    """Return the path through the solved poses (K, 4, 4). In joint mode, the path follows the odometry between keyframes."""
     # Between two keyframes, the path follows the odometry. The localisation would bring back its jitter.
     after = correct_path(path, keyframes.stamps, keyframes.map_T_base, map_T_base)
     way = log.odometry

@@ -8,8 +8,7 @@ from objslam.mapping.stages.described import DescribedDrive
 
 
 def reason_to_solve(of: DescribedDrive, result: RunResult) -> str:
-    """Return why given poses seem to be wrong, "" if they do not, or if the poses were solved. result: of the described
-    drive."""
+    """Return why the poses should be solved once more, "" if they should not. result: the result of the described drive."""
     drive, solution = of.found.drive, of.found.solution
     if of.late is not None:
         return "the localisation errs for seconds"

@@ -21,8 +21,8 @@ from objslam.mapping.stages.drive import Drive
 
 @dataclass(frozen=True)
 class SolvedDrive:
-    """A drive and its solution. errors: the shared errors that were estimated, None if there are none. before: the shared
-    errors of all rays before the solve in joint mode, None in fixed mode or if there are none."""
+    """A drive and its solution. errors: the shared errors that were estimated, None if none were. before: in joint mode, the
+    shared errors as before the solve, with all frames. It is None in fixed mode, and if there are no shared errors."""
 
     drive: Drive
     solution: Solution
@@ -35,7 +35,7 @@ def solved(
 ) -> SolvedDrive:
     """Return the solution of a drive in its mode.
 
-    earlier: what a map of the same drive at its given poses tells, None without one. SolveError if the solve fails.
+    earlier: an earlier map of the same drive at its given poses, None without one. SolveError if the solve fails.
     """
     log, settings, diagnosis = drive.log, drive.settings, drive.diagnosis
     # Wrong input looks like large shared errors. Their estimation would take many rounds, and no object counts anyway.
@@ -49,7 +49,7 @@ def solved(
     except SolveError:
         say(diagnosis, ledger)
         raise
-    if solution.errors is not None:  # It may have more errors, and settings for them.
+    if solution.errors is not None:  # The solve may have added held errors, and settings for them.
         errors, settings = solution.errors, solution.errors.settings
     before = shared_errors(log, frames, rays, settings) if drive.joint else None
     return SolvedDrive(replace(drive, settings=settings), solution, errors, before)
@@ -65,7 +65,7 @@ def without_refuted_findings(found: SolvedDrive, progress: Progress) -> SolvedDr
 def without_solved_errors(found: SolvedDrive, ledger: Ledger) -> SolvedDrive:
     """Return the drive and its solution without the shared errors that were solved.
 
-    The ledger warns of large ones, and of all findings so far.
+    The ledger warns of large errors, and of all findings so far.
     """
     drive, solution, errors = found.drive, found.solution, found.errors
     if drive.joint and drive.settings.checks.use and errors is not None and not drive.diagnosis.spoilt:
