@@ -2,7 +2,7 @@
 
 No fixed threshold fits all objects, because the box of a large object wanders by many times the pixel noise. So the
 consensus is the subset of rays whose agreement is the least likely by chance (Moisan & Stival, IJCV 57, 2004; Moisan, Moulon
-& Monasse, IPOL 2, 2012). The number of false alarms (NFA) measures this: how many subsets would agree equally well by
+& Monasse, IPOL 2, 2012). The number of false alarms (NFA) is the expected number of subsets that agree equally well by
 chance.
 """
 
@@ -24,16 +24,16 @@ from objslam.triangulation.bundle import Bundle
 from objslam.triangulation.point_to_lines import PointSolution, minimise_distances
 
 _VIEW_CAP = 1 - math.cos(math.radians(45))
-"""The solid angle, in units of 2 pi sr, in which wrong boxes are evenly distributed: a cone of 45 degrees half angle. With a
-larger angle, agreement counts as chance more rarely."""
-_NOISE_SIGMAS = 3.0  # Deviations of a ray below this many standard deviations of noise all score the same.
-_MOST_NOISE = 0.25  # Noise covers at most this share of the view. With a larger share, noisy rays agree with any point.
+"""The solid angle, in units of 2 pi sr, in which wrong boxes are evenly distributed. It is a cone with a half angle of 45
+degrees. With a larger angle, agreement counts as chance more rarely."""
+_NOISE_SIGMAS = 3.0  # All deviations of a ray below this number of standard deviations score the same.
+_MOST_NOISE = 0.25  # The most that noise covers of the view, as a share. With more, noisy rays agree with any point.
 _PAIRS_AT_ONCE = {"numpy": 1 << 17, "cpu": 1 << 19, "cuda": 1 << 25}
-"""The most pairs of a ray and a hypothesis computed together, for each backend. More need more memory, 50 bytes a pair.
-Fewer need more calls. In numpy, the arrays of 2^19 pairs are so large that the system gives new pages for each, and a
-consensus took 1.6 times as long as with 2^16 or 2^17. On an H100, 256,000,000 pairs took 1067 ms with 2^19, 77 ms with 2^23,
-64 ms with 2^25, and 62 ms with 2^29."""
-_MAX_ROUNDS = 20  # The most rounds of Eq. 1 and selection. They end if the agreement stops growing. More are slower.
+"""The most pairs of a ray and a hypothesis that are computed together, for each backend. A pair needs 50 bytes of memory.
+Fewer pairs need more calls. In numpy, a consensus with 2^19 pairs took 1.6 times as long as with 2^16 or 2^17, because the
+system gives new memory pages to each array of this size. On an H100, 256,000,000 pairs took 1067 ms with 2^19, 77 ms with
+2^23, 64 ms with 2^25, and 62 ms with 2^29."""
+_MAX_ROUNDS = 20  # The most rounds of Eq. 1 and selection. They end early if no selection changes. More are slower.
 
 
 def fit_consensus(
@@ -42,11 +42,13 @@ def fit_consensus(
     """Solve Eq. 1 for each object on its agreeing rays. Return the solutions, the agreeing rays (R,) and the log NFA (N,).
 
     Each object has three candidate points: the solution of Eq. 1 on all its rays, the best midpoint of two rays, and a point
-    far ahead, on which nearly parallel rays agree. No pairs are tried for 2 rays, or if all rays agree with the first point
-    within noise. From the best candidate on, two steps alternate while the agreement grows: select the rays that agree with
-    the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all its rays.
+    far ahead, on which nearly parallel rays agree. Midpoints are left out for an object with 2 rays, and if all rays agree
+    with the first point within noise. The search starts at the best candidate. It selects the rays that agree with the
+    point, and solves Eq. 1 on them. It repeats this while the agreement grows. An object without two agreeing rays keeps all
+    its rays.
 
-    judged: (N,) the objects whose rays certainly do not meet by chance. They keep all rays that agree within noise.
+    judged: (N,) the objects whose rays certainly do not meet by chance. Such an object keeps all its rays if they all agree
+    within noise.
     hypotheses, jitter: as in `best_pair`.
     """
     xp = bundle.xp
@@ -82,7 +84,10 @@ def fit_consensus(
 
 
 def _within_noise(bundle: Bundle, points: Tensor) -> Tensor:
-    """Return for which objects (N,) all rays agree with the object's point within noise. No other point can score better."""
+    """Return a mask (N,) of the objects whose rays all agree with their point within noise.
+
+    No other point can score better for such an object. points: (N, 3).
+    """
     to_point = points[bundle.index] - bundle.origin
     distance = length(to_point).clip(min=1e-12)
     cos = (to_point * bundle.direction).sum(axis=1) / distance
@@ -104,7 +109,7 @@ def consensus_about(bundle: Bundle, points: Tensor, objects: Tensor) -> tuple[Te
     agreement.
 
     The best point is the first one with the lowest log NFA. A log NFA below 0 means that the agreement is not by chance.
-    objects: (B,) the indices of the objects that are judged. No ray of another object agrees, and its log NFA is infinite.
+    objects: (B,) the indices of the objects that are judged. Other objects have no agreeing rays and an infinite log NFA.
     """
     xp = bundle.xp
     inlier = xp.zeros_like(bundle.index, dtype=xp.bool)
@@ -112,7 +117,7 @@ def consensus_about(bundle: Bundle, points: Tensor, objects: Tensor) -> tuple[Te
     for chunk, rays, real in bundle.blocks(objects, _PAIRS_AT_ONCE[backend_of(points)] // points.shape[1]):
         chance = _chance(bundle, rays, real, points[chunk])
         nfa, limit = _least_chance(chance, bundle.number[chunk], xp)
-        nfa = xp.where(xp.isnan(nfa), xp.inf, nfa)  # Of a candidate that does not exist.
+        nfa = xp.where(xp.isnan(nfa), xp.inf, nfa)  # A candidate that does not exist has the point NaN.
         row, best = xp.arange(len(nfa), device=nfa.device), nfa.argmin(axis=1)
         log_nfa[chunk], chance = nfa[row, best], chance[row, best]
         inlier[rays[real]] = ((chance <= limit[row, best, None]) & (chance < 1))[real]
@@ -120,8 +125,8 @@ def consensus_about(bundle: Bundle, points: Tensor, objects: Tensor) -> tuple[Te
 
 
 def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) -> Tensor:
-    """Return for each object the midpoint (B, 3) of two of its rays: the midpoint with which its rays agree most. NaN if no
-    midpoint exists.
+    """Return for each object the midpoint (B, 3) of two of its rays with which its rays agree most. NaN if no midpoint
+    exists.
 
     objects: (B,) indices. hypotheses: the most pairs tried per object. If an object has more pairs, their list is split into
     `hypotheses` equal parts, and one pair of each part is tried. jitter: (hypotheses,) in [0, 1), the relative position of
@@ -150,8 +155,11 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
 
 
 def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor, xp: ModuleType) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the two rays of each pair, as indices (B, H) `first` < `second` among the rays of an object, and whether the
-    pair exists. number: (B,) rays of each object. which, jitter: (H,) the indices and the jitter of the hypotheses."""
+    """Return the first and the second ray (B, H) of each pair, as indices among the object's rays, and which pairs exist.
+
+    The first index is below the second. number: (B,) the number of rays of each object. which, jitter: (H,) the indices and
+    the jitter of the hypotheses.
+    """
     n = as_type(number[:, None], jitter)
     pairs = n * (n - 1) / 2
     rank = xp.where(pairs <= hypotheses, which, xp.floor((which + jitter) * (pairs / hypotheses)))
@@ -166,9 +174,11 @@ def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor, xp: M
 
 
 def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the midpoints (B, H, 3) of the closest approach of two rays (B, H), and whether they exist. Parallel rays have
-    no midpoint. A midpoint may lie behind a ray. The ray then does not agree with it. `closest_approach` does the same in
-    numpy."""
+    """Return the midpoints (B, H, 3) of the closest approach of two rays (B, H), and which midpoints exist (B, H).
+
+    Parallel rays have no midpoint. A midpoint may lie behind a ray, and then this ray does not agree with the midpoint.
+    `closest_approach` does the same in numpy.
+    """
     xp = bundle.xp
     n1, n2 = bundle.direction[first], bundle.direction[second]
     between = bundle.origin[second] - bundle.origin[first]
@@ -184,8 +194,10 @@ def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, T
 
 
 def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tensor:
-    """Return, for each ray, the probability (B, H, n) that the ray of a wrong box passes the point (B, H, 3) at least as
-    closely. It is 1 for a ray that points away from the point, and for a ray that is not `real`."""
+    """Return the probabilities (B, H, n) that the ray of a wrong box passes a point (B, H, 3) as closely as each ray does.
+
+    The probability is 1 for a ray that is not `real`. It is also 1 for a ray more than 45 degrees away from the point.
+    """
     xp = bundle.xp
     origin, direction, sigma = bundle.origin[rays], bundle.direction[rays], bundle.sigma[rays]
     along = points @ direction.mT - (origin * direction).sum(-1)[:, None]
@@ -200,8 +212,10 @@ def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tenso
 
 
 def _least_chance(chance: Tensor, number: Tensor, xp: ModuleType) -> tuple[Tensor, Tensor]:
-    """Return the lowest log NFA (B, H) over all numbers k of agreeing rays, and the k-th lowest chance for this k. The
-    agreeing rays have the lowest chances. chance: (B, H, n) of each ray.
+    """Return the lowest log NFA (B, H) over all numbers k of agreeing rays, and the k-th lowest chance (B, H) for this k.
+
+    The k agreeing rays are those with the lowest chances. chance: (B, H, n) as `_chance` returns it. number: (B,) the number
+    of rays of each object.
 
     NFA(k) = (n - 2) C(n, k) C(k, 2) p_k^(k - 3/2), where p_k is the k-th lowest chance. The k rays measure 2 k coordinates,
     and 3 of them determine the point. Each p counts for 2 coordinates.

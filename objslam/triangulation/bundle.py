@@ -7,18 +7,20 @@ from types import ModuleType
 from objslam.core.array_module import Tensor, indices_of
 
 _SIMILAR = (2, 32)
-"""The numbers a and b. If the smallest object of a block has n rays, the largest one has at most a n + b rays. Fillers make
-all objects of a block equally long. Larger values make fewer blocks with more fillers. With these values, at most about half
-of a block is fillers. The share is larger if objects have few rays, but such a block costs little."""
+"""The numbers a and b that limit the sizes of the objects in a block. If the smallest object has n rays, the largest one has
+at most a n + b rays. Fillers make all objects of a block equally long. Larger numbers make fewer blocks with more fillers.
+With 2 and 32, at most about half of a block is fillers. If objects have few rays, the share of fillers is larger, but such a
+block costs little."""
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """Rays of many objects, sorted by object. All arrays are numpy arrays, or all are torch tensors.
+    """R rays of N objects, sorted by object. All arrays are numpy arrays, or all are torch tensors.
 
-    origin: (R, 3) m, in coordinates of the ray's object. direction: (R, 3) unit. sigma: (R,) rad, noise of a ray's angle
-    along each perpendicular axis. position_sigma: m, noise of the origins along each axis. index: (R,) object of each ray.
-    number: (N,) number of rays of each object. xp: the library of the arrays, numpy or torch.
+    origin: (R, 3) m, relative to a point near the ray's object, with the axes of map. direction: (R, 3) unit. sigma: (R,)
+    rad, the standard deviation of a ray's angle along each perpendicular axis. position_sigma: m, the standard deviation of
+    the origins along each axis. index: (R,) the object of each ray. number: (N,) the number of rays of each object. xp: the
+    library of the arrays, numpy or torch.
     """
 
     origin: Tensor
@@ -39,15 +41,15 @@ class Bundle:
         return Bundle(*rays, index, number, self.xp)
 
     def blocks(self, objects: Tensor, most: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Split objects, given by their indices, into blocks of B objects with up to n rays each.
+        """Split objects into blocks of B objects with up to n rays each. objects: the indices of the objects.
 
-        A block holds the objects (B,), the indices of their rays (B, n), and which of these indices are real. The other
+        A block holds the objects (B,), the indices (B, n) of their rays, and a mask (B, n) of the real indices. All other
         indices only fill the rows of objects with fewer rays. most: the largest B n of a block of several objects.
         """
         xp = self.xp
         first = xp.cumsum(self.number, 0) - self.number
         objects = objects[xp.argsort(self.number[objects], stable=True)]
-        size = self.number[objects]  # The sizes increase, so the fitting objects come first.
+        size = self.number[objects]  # The sizes increase, so the objects that fit into a block follow each other.
         sizes = size.tolist()
         begin = 0
         while begin < len(sizes):

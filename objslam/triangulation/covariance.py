@@ -9,19 +9,19 @@ from objslam.triangulation.bundle import Bundle
 from objslam.triangulation.lines import Lines
 
 _EVERY_PAIR = 256  # Up to this number of rays of an object, `parallax` compares every pair. A larger number costs time.
-_PLACES = 1 << 13  # The most rays, with fillers, that `parallax` compares together. A larger number needs memory.
-_RANGE_ITERATIONS = 30  # The iterations of the range fit of every object. The fit starts at the median range.
+_PLACES = 1 << 13  # The most rays, with fillers, that `parallax` compares together. More need more memory.
+_RANGE_ITERATIONS = 30  # The number of iterations of the range fit. More are slower. It starts at the median range.
 
 
 def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
-    """Return the covariance (N, 3, 3) m^2 of each solution of Eq. 1 on the rays in `use` (R,). NaN if these fix no point.
+    """Return the covariance (N, 3, 3) m^2 of each solution of Eq. 1 on the rays in `use` (R,). NaN if they fix no point.
 
     Eq. 1 is an M-estimator with covariance A^-1 B A^-1, where A is the expected Hessian and B the gradient covariance (Huber
     & Ronchetti, Robust Statistics, ch. 6). The offset of ray i is Gaussian with standard deviation s_i along both axes
     across the ray. Then the direction u of the offset has E[u u^T] = P / 2, where P projects across the ray. The length d of
     the offset is independent of u, and E[1 / d] = sqrt(pi / 2) / s_i. So a ray adds sqrt(pi / 2) / (2 s_i) P to A, and P / 2
     to B. Residuals above s_i widen the result. Smaller residuals do not narrow it. Eq. 1 also has a bias that more rays do
-    not reduce: rays miss a nearer object by less. So angular noise tilts u forward along ray i, E[u] = sqrt(pi / 2)
+    not reduce, because rays miss a nearer object by less. Angular noise tilts u forward along ray i by E[u] = sqrt(pi / 2)
     sigma_i^2 r_i / s_i, where r_i is the length of the ray. The result includes the square of this bias.
     """
     rays, xp = bundle.select(use), bundle.xp
@@ -44,11 +44,11 @@ def fuse_ranges(
 ) -> tuple[Tensor, Tensor]:
     """Fuse the rays in `use` (R,) with their ranges (R,) m, and return points (N, 3) m and covariances (N, 3, 3) m^2.
 
-    It is for objects whose rays alone are too uncertain. A ray without a range has the range NaN, and an object without a
-    range gets NaN. range_bias: (R,) m, the standard deviation of an error that all ranges of an object share. The covariance
-    includes this error. Across the rays, the loss is squared, because `use` has no outliers. Along the rays, it is Cauchy's,
-    because a range may belong to the background. `association.refinement.refine` is robust in both directions, but gives no
-    covariance.
+    This is for objects whose rays alone are too uncertain. A ray without a range has the range NaN. An object without a
+    range gets NaN. range_sigma: (R,) m, the noise of single ranges. range_bias: (R,) m, the standard deviation of an error
+    that all ranges of an object share. The covariance includes both. Across the rays, the loss is the square, because `use`
+    has no outliers. Along the rays, the loss is Cauchy's, because a range may belong to the background.
+    `association.refinement.refine` is robust in both directions, but gives no covariance.
     """
     xp = bundle.xp
     rays, count = bundle.select(use), len(bundle.number)
@@ -116,7 +116,7 @@ def reach(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
 
 
 def lies_ahead(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
-    """Return whether each point (N, 3) lies ahead of more than half of its rays in `use` (R,)."""
+    """Return a mask (N,) of the points (N, 3) that lie ahead of more than half of their rays in `use` (R,)."""
     index = bundle.index[use]
     towards = ((point[index] - bundle.origin[use]) * bundle.direction[use]).sum(1)
     return group_sum(bundle.xp.sign(towards), index, len(point)) > 0
@@ -124,8 +124,10 @@ def lies_ahead(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
 
 def parallax(bundle: Bundle, use: Tensor) -> Tensor:
     """Return the widest angle (N,) rad between any two rays in `use` (R,) of each object. Rays are undirected lines here.
-    Of more than `_EVERY_PAIR` rays, only the rays nearest to 64 evenly spread axes are compared. The angle is then exact to
-    1 %."""
+
+    If an object has more than `_EVERY_PAIR` rays, only the rays nearest to 64 evenly spread axes are compared. The angle is
+    then exact to 1 %.
+    """
     xp = bundle.xp
     rays = bundle.select(use)
     widest = xp.zeros(len(rays.number), dtype=rays.direction.dtype, device=rays.direction.device)
@@ -150,8 +152,11 @@ def parallax(bundle: Bundle, use: Tensor) -> Tensor:
 
 
 def object_median(values: Tensor, index: Tensor, count: int) -> Tensor:
-    """Return the median (N,) of the values (R,) of each object. NaN without values. index: (R,) the object of each value.
-    `core.statistics.grouped_median` returns the upper median in numpy."""
+    """Return the median (N,) of the values (R,) of each object. It is NaN for an object without values.
+
+    index: (R,) the object of each value. count: the number N of objects. For an even number of values, this is the mean of
+    the two middle ones, and `core.statistics.grouped_median` returns the upper one.
+    """
     xp = module_of(values)
     if len(values) == 0:
         return xp.full((count,), xp.nan, dtype=values.dtype, device=values.device)
@@ -172,10 +177,10 @@ def _offset_sigma(rays: Bundle, distance: Tensor) -> Tensor:
 def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
     """Return the factor (N,), at least 1, by which the variance of the residuals exceeds its expectation.
 
-    miss: (R,) normalised residuals. Their mean is used, because it is more robust than their mean square. taken: how many of
-    the 2 n degrees of freedom of n rays the fit uses up. The excess over 1 is enlarged, because few remaining degrees of
-    freedom (`rest`) give an uncertain estimate. The enlargement 1 + 3.2 / (rest - 2) is the 95 % quantile of F(3, rest),
-    divided by its limit for a large rest. It is exact to 3 % from 4 rays on.
+    miss: (R,) normalised residuals. Their mean is used, because it is more robust than their mean square. taken: the number
+    of degrees of freedom that the fit uses up, of 2 n for n rays. The excess over 1 is enlarged, because few remaining
+    degrees of freedom (`rest`) give an uncertain estimate. The enlargement 1 + 3.2 / (rest - 2) is the 95 % quantile of F(3,
+    rest), divided by its limit for a large rest. It is exact to 3 % from 4 rays on.
     """
     number = as_type(rays.number, miss)
     mean = group_sum(miss, rays.index, len(number)) / number.clip(min=1) / RAYLEIGH_MEAN

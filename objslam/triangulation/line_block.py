@@ -1,7 +1,7 @@
 """Lines of several objects in dense arrays, and small symmetric systems of all objects at once.
 
-The coordinates of a vector are the first axis and the objects the last one. So each operation is one pass over contiguous
-numbers, and a sum over the lines of an object needs no indices.
+The first axis of an array holds the coordinates of a vector, and the last axis the objects. So each operation is one pass
+over contiguous numbers, and a sum over the lines of an object needs no indices.
 """
 
 from __future__ import annotations
@@ -34,8 +34,10 @@ class LineBlock:
         return perpendicular(points[:, None], self.direction) - self.foot
 
     def spread(self, weight: Tensor) -> Tensor:
-        """Return the sum of weight (n, B) times I - d d^T over the lines of each object, by its six entries (6, B). d: a
-        line's direction."""
+        """Return the six entries (6, B) of the sum of weight (n, B) times I - d d^T over the lines of each object.
+
+        d: the direction of a line. The order of the entries is that of `outer`.
+        """
         result = -outer(self.direction * weight, self.direction, self.xp)
         result[:3] += weight.sum(axis=0)
         return result
@@ -53,7 +55,7 @@ def gather(bundle: Bundle, rays: Tensor, real: Tensor) -> tuple[Tensor, Tensor, 
     """Return origins (3, n, B), directions (3, n, B) and weights (n, B) of one block of rays.
 
     rays, real: (B, n) as `Bundle.blocks` yields them. The longer one of the axes n and B is contiguous in memory, because a
-    pass over a short one is slow.
+    pass along a short contiguous axis is slow.
     """
     wide = rays.shape[0] >= rays.shape[1]
     weight = as_type(real, bundle.origin)
@@ -108,9 +110,11 @@ def full(six: Tensor) -> Tensor:
 
 
 def solve_symmetric(a: Tensor, b: Tensor, xp: ModuleType) -> tuple[Tensor, Tensor]:
-    """Return x (3, B) with A x = b by Cramer's rule, and the regularity (B,) of A, from 0 to 1. The regularity is the
-    determinant divided by the cube of the mean eigenvalue. a: (6, B) positive semidefinite. b: (3, B). If A is singular, x
-    has no meaning."""
+    """Return x (3, B) with A x = b by Cramer's rule, and the regularity (B,) of A, from 0 to 1.
+
+    The regularity is the determinant divided by the cube of the mean eigenvalue. If A is singular, x has no meaning. a: (6,
+    B) the entries of A, which is positive semidefinite, in the order of `outer`. b: (3, B).
+    """
     xx, yy, zz, xy, xz, yz = a
     c0, c1, c2 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     determinant = xx * c0 + xy * c1 + xz * c2

@@ -1,4 +1,7 @@
-"""Lines of many objects in flat arrays, with an object index per line. `line_block` is faster for repeated passes."""
+"""Lines of many objects in flat arrays, with the index of its object for each line.
+
+`line_block` is faster for repeated passes.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +14,11 @@ from objslam.core.array_module import Tensor, group_sum
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines to many objects. Each object has its own coordinates. foot: (R, 3) the point of each line nearest to the
-    coordinate origin of its object. direction: (R, 3) unit. index: (R,) the object of each line. count: the number N of
-    objects. xp: the library of the arrays, numpy or torch."""
+    """R lines to N objects. Each object has its own coordinates.
+
+    foot: (R, 3) the point of each line nearest to the coordinate origin of its object. direction: (R, 3) unit. index: (R,)
+    the object of each line. count: the number N of objects. xp: the library of the arrays, numpy or torch.
+    """
 
     foot: Tensor
     direction: Tensor

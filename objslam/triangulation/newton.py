@@ -1,7 +1,8 @@
 """Newton's method for Eq. 1, for all objects of a block at once.
 
-Let q be the offset of the point from a line along n, and d its length, the distance. The distance has the gradient u = q / d
-and the Hessian t t^T / d, where t = n x u. The unit of length is about the mean distance of an object from its lines.
+Let n be the direction of a line, and q the offset of the point from this line. The length d of q is the distance. The
+distance has the gradient u = q / d and the Hessian t t^T / d, where t = n x u. The unit of length is about the mean distance
+of an object from its lines.
 """
 
 from __future__ import annotations
@@ -10,19 +11,19 @@ from objslam.core.array_module import Tensor, as_single, as_type, take_along
 from objslam.triangulation.line_block import UPPER, LineBlock, dot, norm, products, solve_symmetric
 
 _WEIGHTED_STEPS = 3
-"""The number of weighted least-squares steps before Newton's. With fewer, outliers keep more weight."""
+"""The number of weighted least-squares steps before the Newton steps. With fewer steps, outliers keep more weight."""
 _SMOOTHING = 0.05
-"""A line at distance d has the weight 1 / sqrt(d^2 + this^2), in mean distances. A larger value keeps more weight on
-outliers."""
+"""The smoothing s of the weights in least-squares steps, in mean distances. A line at distance d has the weight
+1 / sqrt(d^2 + s^2). A larger smoothing keeps more weight on outliers."""
 _SINGLE_STEPS = 3
-"""The most Newton steps in single precision, which take half the time of steps in double precision. More steps do not
-improve a single-precision point."""
+"""The most Newton steps in single precision. They take half the time of steps in double precision. More steps do not make
+the point more exact than single precision allows."""
 _STEPS = 6
 """The most Newton steps in double precision. An object that needs more has a line through or near its solution."""
 _LINE_STEPS = 6
 """The number of Newton steps along the nearest line. More steps are more exact and slower."""
 _SHORTER = 0.3
-"""The factor for a step that did not lower the cost enough. A larger factor shortens the step less."""
+"""The factor by which a step is shortened if it did not lower the cost enough. A larger factor shortens it less."""
 _SINGLE, _DOUBLE = 2.0**-23, 2.0**-52
 """The relative distance between neighbouring numbers near 1, in single and in double precision."""
 _TINY = 1e-30
@@ -30,8 +31,10 @@ _TINY = 1e-30
 
 
 def approach(lines: LineBlock) -> tuple[Tensor, int]:
-    """Start at the coordinate origin. Return points (3, B) near the optimum, exact to about 1e-6, and the number of
-    steps."""
+    """Return points (3, B) near the optimum, exact to about 1e-6 units of length, and the number of steps.
+
+    The steps start at the coordinate origin.
+    """
     xp = lines.xp
     rough = LineBlock(as_single(lines.foot), as_single(lines.direction), as_single(lines.weight), xp)
     point = xp.zeros_like(rough.foot[:, 0])
@@ -47,11 +50,11 @@ def approach(lines: LineBlock) -> tuple[Tensor, int]:
 def newton(lines: LineBlock, start: Tensor, steps: int = _STEPS) -> tuple[Tensor, Tensor, Tensor, int]:
     """Take Newton steps from the start (3, B). A step that does not lower the cost enough is shortened.
 
-    steps: the most evaluations of the cost, with those of the start and of shortened steps.
+    steps: the most evaluations of the cost. The start and each shortened step need one evaluation too.
 
     Returns:
-        The points (3, B), the gradient norms (B,), which objects are solved up to rounding (B,), and the number of
-        evaluations. An unsolved object may have a line through or near its solution, or no curvature.
+        The points (3, B), the gradient norms (B,), a mask (B,) of the objects that are solved up to rounding, and the number
+        of evaluations. An unsolved object may have a line through or near its solution, or no curvature.
     """
     xp = lines.xp
     epsilon = _SINGLE if start.dtype == xp.float32 else _DOUBLE
@@ -92,10 +95,10 @@ def newton(lines: LineBlock, start: Tensor, steps: int = _STEPS) -> tuple[Tensor
 def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
     """Solve objects whose nearest line to the start (3, B) passes through or near the solution. Return the same as `newton`.
 
-    First, the point on this line with the least sum of distances from the other lines is found. Across the line, this sum
-    has a gradient at the point. If the gradient is at most 1, the point is the optimum of Eq. 1 (Kuhn, Math. Programming 4,
-    1973), and the smallest subgradient has the returned norm. If the gradient is larger, the optimum lies beside the line,
-    and Newton steps start there.
+    First, the point on this line with the least sum of distances from the other lines is found. The gradient of this sum at
+    the point is taken across the line. If its norm is at most 1, the point is the optimum of Eq. 1 (Kuhn, Math. Programming
+    4, 1973), and the returned norm is that of the smallest subgradient. If the norm is larger, the optimum lies beside the
+    line, and Newton steps start beside it.
     """
     xp = lines.xp
     far = norm(lines.offset(start)) + xp.where(lines.weight > 0, 0.0, xp.full_like(lines.weight, xp.inf))
@@ -126,9 +129,11 @@ def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, T
 
 
 def _slopes(lines: LineBlock, point: Tensor, axis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return three values of Eq. 1 at points (3, B): the gradient (3, B), the second derivative (B,) along the unit vectors
-    `axis` (3, B), and the rounding error (B,) of the gradient. This error is in units of epsilon: the sum of 1 + 1 / d, at
-    most 1e6."""
+    """Return the gradient (3, B) of Eq. 1 at points (3, B), the second derivative (B,) along unit vectors `axis` (3, B), and
+    the rounding error (B,) of the gradient.
+
+    The rounding error is in units of epsilon. It is the sum of 1 + 1 / d over the lines, at most 1e6.
+    """
     q = lines.offset(point)
     inverse = lines.weight / norm(q).clip(min=_TINY)
     u = q * inverse
@@ -138,8 +143,10 @@ def _slopes(lines: LineBlock, point: Tensor, axis: Tensor) -> tuple[Tensor, Tens
 
 
 def _hessian(lines: LineBlock, u: Tensor, inverse: Tensor) -> Tensor:
-    """Return the sums of t t^T / d with t = n x u, by their six entries (6, B). u: (3, n, B) and inverse: (n, B) 1 / d,
-    both zero for a filler."""
+    """Return the six entries (6, B) of the sums of t t^T / d over the lines of each object, with t = n x u.
+
+    u: (3, n, B). inverse: (n, B) 1 / d. Both are zero for a filler.
+    """
     x, y, z = lines.direction
     a, b, c = u
     t = lines.xp.stack([y * c - z * b, z * a - x * c, x * b - y * a])

@@ -1,7 +1,7 @@
 """Solve Eq. 1 of Staszak & Belter: find the point with the least sum of distances to lines, for many objects at once.
 
-Newton's method solves most objects in a few steps. Where a line passes through or near the solution, the distance has no
-smooth derivative, and `smoothed_newton` finishes.
+Newton's method solves most objects in a few steps. If a line passes through or near the solution, the distance has no smooth
+derivative there. `off_nearest_line` and then `smoothed_newton` solve such objects.
 """
 
 from __future__ import annotations
@@ -28,24 +28,27 @@ from objslam.triangulation.smoothed_newton import finish
 
 _PLACES = {"numpy": 1 << 14, "cpu": 1 << 16, "cuda": 1 << 24}
 """The most rays, with fillers, in one block, for each backend. Smaller blocks need more calls, and a call of torch costs
-more than one of numpy. Larger blocks do not fit into the cache of a CPU: blocks four times as large take 1.1 (numpy) and 1.2
-times (torch) as long. On CUDA, a ray needs 0.5 kB. On an H100, 5,000,000 rays took 497 ms with 2^18, 161 ms with 2^22, and
-as long with up to 2^26."""
+more than a call of numpy. Larger blocks do not fit into the cache of a CPU. Blocks four times as large take 1.1 times as
+long in numpy, and 1.2 times in torch. On CUDA, a ray needs 0.5 kB. On an H100, 5,000,000 rays took 497 ms with 2^18, and 161
+ms with 2^22 up to 2^26."""
 _ROUNDS = 3
 """The most rounds of `off_nearest_line` for the objects with a line near the solution. `smoothed_newton` solves the rest.
 More rounds leave fewer objects for it."""
 _FEW = 1 << 16
-"""The most rays, with fillers, of objects that `smoothed_newton` solves in numpy instead of torch. It takes hundreds of
-calls for each step, and usually a few objects of many thousands are left for it. A larger number calls CUDA less often."""
+"""The most rays, with fillers, that `smoothed_newton` solves in numpy instead of torch. `smoothed_newton` needs hundreds of
+calls for each step, and usually solves only a few objects of many thousands. With a larger number, CUDA is called less."""
 _LEAST_REGULAR = 1e-6
-"""If a matrix is less regular than this (from 0 to 1), its eigenvalues decide whether the lines fix a point. A larger value
-computes eigenvalues more often."""
+"""The regularity of a matrix, from 0 to 1, below which its eigenvalues decide whether the lines fix a point. With a larger
+value, eigenvalues are computed more often."""
 
 
 @dataclass(frozen=True)
 class PointSolution:
-    """Solutions of Eq. 1. point: (N, 3) m. determined: (N,) whether the rays fix the point. gradient: (N,) norm of the
-    gradient, NaN if the rays do not fix the point. iterations: the number of solver iterations."""
+    """The solutions of Eq. 1 for N objects.
+
+    point: (N, 3) m. determined: (N,) whether the rays fix the point. gradient: (N,) the norm of the gradient, NaN if the
+    rays do not fix the point. iterations: the number of solver iterations.
+    """
 
     point: Tensor
     determined: Tensor
@@ -54,10 +57,10 @@ class PointSolution:
 
 
 def least_squares(bundle: Bundle) -> tuple[Tensor, Tensor]:
-    """Return the points (N, 3) with the least sum of squared distances to their rays as lines, and which are unique (N,).
+    """Return the points (N, 3), m, with the least sum of squared distances to their rays, and a mask (N,) of unique points.
 
-    Parallel rays and a single ray fix no point. The result is then the point of the mean ray that lies 1 m ahead of the mean
-    origin. It is NaN without rays.
+    The rays count as lines. A single ray and parallel rays fix no point. The result is then the point on the mean ray that
+    lies 1 m ahead of the mean origin. It is NaN for an object without rays.
     """
     point, determined = _unsolved(bundle)
     for objects, rays, real in bundle.blocks(bundle.with_rays(), _places(bundle)):
@@ -69,8 +72,8 @@ def least_squares(bundle: Bundle) -> tuple[Tensor, Tensor]:
 def minimise_distances(bundle: Bundle) -> PointSolution:
     """Solve Eq. 1 for every object, from the start of `least_squares`.
 
-    If lines pass through the solution, the gradient is the smallest subgradient found. The value 0 still proves the optimum.
-    An object whose rays fix no point keeps the point of `least_squares` and gets a NaN gradient.
+    If lines pass through the solution, the gradient is the smallest subgradient that was found. A norm of 0 still proves the
+    optimum. An object whose rays fix no point keeps the point of `least_squares` and gets a NaN gradient.
     """
     xp = bundle.xp
     point, determined = _unsolved(bundle)
@@ -132,7 +135,7 @@ def _places(bundle: Bundle) -> int:
 
 
 def _closed_form(origin: Tensor, direction: Tensor, weight: Tensor, xp: ModuleType) -> tuple[Tensor, Tensor]:
-    """Return the points (3, B), m, of `least_squares` for the B objects of a block, and which of the points are unique (B,).
+    """Return the points (3, B), m, of `least_squares` for the B objects of a block, and a mask (B,) of the unique points.
 
     origin: (3, n, B) m. direction: (3, n, B) unit. weight: (n, B), 1 for a ray and 0 for a filler.
     """
@@ -160,10 +163,10 @@ def _closed_form(origin: Tensor, direction: Tensor, weight: Tensor, xp: ModuleTy
 
 
 def _unit_lines(origin: Tensor, direction: Tensor, weight: Tensor, xp: ModuleType) -> tuple[LineBlock, Tensor, Tensor]:
-    """Return lines in units of their mean distance from the coordinate origin. Also return this unit (B,) m, and for which
-    objects (B,) all lines meet in the coordinate origin, up to rounding.
+    """Return lines in units of their mean distance from the coordinate origin, this unit (B,), m, and a mask (B,) of the
+    objects whose lines all meet in the coordinate origin, up to rounding.
 
-    Lines that meet there stay in m. origin: (3, n, B) m. The coordinate origin is a point of the object.
+    Lines that meet there stay in m. The coordinate origin is a point of the object. origin: (3, n, B) m.
     """
     lines = through(origin, direction, weight, xp)
     number = weight.sum(axis=0)

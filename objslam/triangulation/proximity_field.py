@@ -1,4 +1,4 @@
-"""The proximity field: the cost of Eq. 1 around one object, as in the heat map of Staszak & Belter's Fig. 2."""
+"""Compute the proximity field of an object: the cost of Eq. 1 around it, as in the heat map of Staszak & Belter, Fig. 2."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,10 @@ _LEAST_REACH, _MOST_REACH = 0.15, 3.0  # The least and the largest half edge (m)
 
 @dataclass(frozen=True)
 class FieldSlice:
-    """A plane of the field. points: (n, n, 3) m in map. cost: (n, n) m, the mean distance of the rays to each point."""
+    """A square grid of points in a plane of the field.
+
+    points: (n, n, 3) m in map. cost: (n, n) m, the mean distance of the rays from each point.
+    """
 
     points: Floats
     cost: Floats
@@ -22,9 +25,12 @@ class FieldSlice:
 
 @dataclass(frozen=True)
 class ProximityField:
-    """The field of one object. minimum: (3,) m, the solution of Eq. 1. cost: m, the mean distance of the rays from the
-    minimum. horizontal: the slice through the minimum parallel to the floor. vertical: the upright slice through the minimum
-    along the mean direction of the rays, in which the object is the least certain."""
+    """The field of one object.
+
+    minimum: (3,) m in map, the solution of Eq. 1. cost: m, the mean distance of the rays from the minimum. horizontal: the
+    slice through the minimum, parallel to the floor. vertical: the upright slice through the minimum, along the mean
+    direction of the rays. The object is the least certain in this direction.
+    """
 
     minimum: Floats
     cost: float
@@ -33,7 +39,7 @@ class ProximityField:
 
 
 def proximity(origins: Floats, directions: Floats, points: Floats) -> Floats:
-    """Return the mean distance (...), m, of points (..., 3) from R > 0 rays: the cost of Eq. 1 divided by R.
+    """Return the mean distances (...), m, of points (..., 3), m, from R > 0 rays. This is the cost of Eq. 1 divided by R.
 
     origins: (R, 3) m. directions: (R, 3) unit.
     """
@@ -54,8 +60,8 @@ def proximity(origins: Floats, directions: Floats, points: Floats) -> Floats:
 def proximity_field(origins: Floats, directions: Floats, size: int = 101, reach: float | None = None) -> ProximityField:
     """Return the field of one object with R >= 2 rays. A slice has `size` x `size` points.
 
-    origins: (R, 3) m. directions: (R, 3) unit. reach: half the edge of a slice, m. None derives it from the distances of the
-    rays. Parallel rays have no minimum. Their slices then lie 1 m ahead, at the point of `solve_eq1`.
+    origins: (R, 3) m. directions: (R, 3) unit. reach: half the edge of a slice, m. If it is None, the distances of the rays
+    give it. Parallel rays have no minimum. Their slices lie 1 m ahead, at the point of `solve_eq1`.
     """
     minimum = solve_eq1(origins, directions, np.zeros(len(origins), dtype=np.int64), 1)[0][0]
     off = np.linalg.norm(np.cross(minimum - origins, directions), axis=1)
@@ -82,7 +88,7 @@ def main_heading(directions: Floats) -> Floats:
 
 
 def supporting_rays(weight: Floats, object_: Bools) -> Bools:
-    """Return a mask (R,) of the rays of an object with a weight (R,) above 0. If there are none, return all its rays.
+    """Return a mask (R,) of the rays of an object with a weight (R,) above 0. If no ray has one, return all its rays.
 
     object_: (R,) the mask of the rays of the object.
     """

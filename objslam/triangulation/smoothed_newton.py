@@ -1,4 +1,4 @@
-"""Find the point closest to all lines (Eq. 1 of Staszak and Belter) where lines pass through or near this point.
+"""Find the point closest to all lines (Eq. 1 of Staszak and Belter), if some lines pass through or near this point.
 
 Smoothed distances are minimised first, and then the distances themselves.
 """
@@ -14,10 +14,10 @@ _MAX_ITERATIONS = 80  # The most Newton steps. A solved object leaves the block 
 _LATE_SMOOTHING = 1e-9  # The smoothing (in mean distances) below which an object gets only a few more Newton steps.
 _LEAST_SMOOTHING = 1e-11  # The least smoothing (in mean distances). It is above the rounding errors.
 _ROUNDING = 1e-14
-"""The residual of the duals counts as zero if its product with the smoothing is below this (in mean distances). An offset is
+"""The size (in mean distances) below which the residual of the duals, times the smoothing, counts as zero. An offset is
 exact to about 1e-15, and a dual is an offset divided by the smoothing. With a smaller value, rounding errors keep the
 smoothing of some objects large until the last step."""
-_ON_LINE = (1e-7, 1e-5)  # The values of `on_line` (in mean distances) that are tried where 0 does not give the optimum.
+_ON_LINE = (1e-7, 1e-5)  # The values of `on_line` (in mean distances) that are tried if 0 does not give the optimum.
 _RIDGE = 1e-10
 """The ridge that is added to a singular matrix, as a share of its norm. It is far above the rounding errors of the matrix. A
 larger value moves the point more slowly along rays that are nearly parallel."""
@@ -28,7 +28,7 @@ def finish(lines: LineBlock) -> tuple[Tensor, Tensor, int]:
     """Solve Eq. 1 from the coordinate origin. Return points (3, B), gradient norms (B,) and the number of iterations.
 
     The unit of length is about the mean distance of an object from its lines. If lines pass through the solution, the
-    gradient is the smallest subgradient found. The value 0 still proves the optimum.
+    gradient is the smallest subgradient that was found. A norm of 0 still proves the optimum.
     """
     xp = lines.xp
     smoothed, dual, iterations = _smoothed_optimum(lines)
@@ -109,10 +109,10 @@ def _newton_step(lines: LineBlock, o: Tensor, q: Tensor, y: Tensor, epsilon: Ten
 
 
 def _solved(curvature: Tensor, gradient: Tensor, xp: ModuleType) -> Tensor:
-    """Return the solutions (B, 3, 1) for symmetric matrices (B, 3, 3), also if one of them is singular.
+    """Return the solutions (B, 3, 1) for symmetric matrices (B, 3, 3), even if a matrix is singular.
 
-    Rays that are parallel to 0.1 degrees have no curvature along them, up to rounding. Rounding may then cancel the small
-    ridge of `_newton_step` exactly.
+    If rays are parallel to 0.1 degrees, the cost has no curvature along them, up to rounding. Rounding may then cancel the
+    small ridge of `_newton_step` exactly.
     """
     try:
         return xp.linalg.solve(curvature, gradient)
@@ -145,7 +145,7 @@ def _exact_optimum(lines: LineBlock, point: Tensor, dual: Tensor, on_line: float
         if newton:
             curvature = full(lines.spread(inverse_d) - outer(u * inverse_d, u, xp))
             point = point - _short_newton(free @ curvature @ free, apply(free, pull), xp)
-    # Each line through the point may add a vector of length up to 1. They are chosen to make the subgradient smallest.
+    # Each line through the point may add a vector up to 1 long. The vectors with the smallest subgradient are sought.
     answer = perpendicular(dual, lines.direction) * on
     for _ in range(30 if bool((on > 0).any()) else 0):
         rest = pull + answer.sum(axis=1)

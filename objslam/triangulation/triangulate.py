@@ -23,22 +23,22 @@ from objslam.triangulation.point_to_lines import least_squares, minimise_distanc
 from objslam.triangulation.range_consensus import agreeing_with_ranges, contradicted
 
 _LARGE = 200_000
-"""With at least this number of rays, CUDA does the work, if there is a card. With fewer, numpy on one core is as fast,
-because the import of torch takes 1.4 s. Without that, 20,000 rays took .18 s in numpy and .08 s on an H100, and 200,000 took
-2.0 and .25 s."""
+"""The number of rays from which on CUDA does the work, if there is a card. With fewer rays, numpy on one core is as fast,
+because the import of torch takes 1.4 s. Without this import, 20,000 rays took 0.18 s in numpy and 0.08 s on an H100, and
+200,000 rays took 2.0 s and 0.25 s."""
 
 
 @dataclass(frozen=True)
 class Triangulation:
     """N objects from one batch of R rays, in the coordinate frame of the rays (map).
 
-    positions: (N, 3) m, NaN without rays. If the rays do not fix an object, its position is a point on their mean ray. The
-    point lies 1 m ahead if no range was measured. covariance: (N, 3, 3) m^2, NaN if not determined. ok: (N,) whether the
-    position is reliable. parallax: (N,) rad, the widest angle between inlier rays as undirected lines. rms: (N,) rad, root
-    mean square angle between the inlier rays and the object. distance: (R,) m between a ray and its object as in Eq. 1, NaN
-    without object. weight: (R,) 1 for an inlier, else 0. counts: (N,) number of inlier rays. iterations: number of solver
-    iterations. gradient: (N,) norm of the gradient of Eq. 1 at the solution, or of the smallest subgradient if rays pass
-    through the solution. It is NaN for a position that is not from Eq. 1.
+    positions: (N, 3) m, NaN for an object without rays. If the rays do not fix an object, its position is a point on their
+    mean ray, 1 m ahead if no range was measured. covariance: (N, 3, 3) m^2, NaN if the rays do not determine it. ok: (N,)
+    whether the position is reliable. parallax: (N,) rad, the widest angle between inlier rays as undirected lines. rms: (N,)
+    rad, the root mean square angle between the inlier rays and the object. distance: (R,) m, between a ray and its object as
+    in Eq. 1, NaN for a ray without object. weight: (R,) 1 for an inlier, else 0. counts: (N,) the number of inlier rays.
+    iterations: the number of solver iterations. gradient: (N,) the norm of the gradient of Eq. 1 at the solution. If rays
+    pass through the solution, it is the norm of the smallest subgradient. It is NaN for a position that is not from Eq. 1.
     """
 
     positions: Floats
@@ -70,12 +70,12 @@ def triangulate(
 ) -> Triangulation:
     """Triangulate all objects of a batch by Eq. 1 on the rays that agree, with covariance and status.
 
-    An object is ok under three conditions. At least 2 rays agree more closely than by chance. The parallax of these rays and
-    the relative precision meet the limits of the settings. The object lies ahead of most of these rays. A measured range
-    replaces the parallax. Without `settings.consensus`, all rays are used, and chance is not judged. Ranges are fused only
-    for an object whose rays fail these limits, or whose ranges, taken together, are more precise than its rays. Other
-    objects keep the position of Eq. 1, because a range ends on the surface of an object and its rays meet inside. The result
-    for an object does not depend on other objects or on ray order.
+    An object is ok under three conditions. At least 2 rays agree more closely than by chance. The parallax of the agreeing
+    rays and the relative precision meet the limits of the settings. The object lies ahead of most of the agreeing rays. A
+    measured range replaces the parallax. Without `settings.consensus`, all rays are used, and chance is not judged. Ranges
+    are fused only for an object whose rays fail the limits, or whose ranges, taken together, are more precise than its rays.
+    Other objects keep the position of Eq. 1, because a range ends on the surface of an object, but its rays meet inside. The
+    result for an object does not depend on other objects or on the order of the rays.
 
     Args:
         origins, directions: (R, 3) m, and (R, 3) of any length above 0.
@@ -85,8 +85,8 @@ def triangulate(
         ranges: (R,) m along the rays, NaN if unknown. range_sigma: (R,) or one number, m, the noise of the ranges.
         range_bias: (R,) or one number, m, the standard deviation of the error that all ranges of an object share.
         position_sigma: m, the noise of the origins along each axis.
-        judged: (N,) whether the association has found that the rays of an object do not meet by chance. Then few rays with
-            much noise can give an object that is ok.
+        judged: (N,) whether the association has found that the rays of an object do not meet by chance. Such an object can
+            be ok with few, noisy rays.
     Raises:
         ValueError: the arrays do not fit together or are not finite.
         ConfigError: the device does not exist.
@@ -125,9 +125,10 @@ def _left(
     ranges: Floats,
     sigma: Floats,
 ) -> Ints:
-    """Return the object (R,) of the rays of objects whose bearings lead away from their ranges, -1 for all other rays.
+    """Return the object (R,) of each ray that is triangulated again, -1 for all other rays.
 
-    The rays that cause this are left out. sigma: (R,) m, of the ranges. Other arguments are as in `triangulate`.
+    These are the rays of objects whose bearings lead away from their ranges, without the rays that cause this. m, n: (R, 3)
+    the origins, m, and the unit directions. sigma: (R,) m, the noise of the ranges. Other arguments are as in `triangulate`.
     """
     left = np.full(len(index), -1)
     away = np.full(len(index), np.nan)
@@ -239,8 +240,9 @@ def solve_eq1(
 ) -> tuple[Floats, int, Floats]:
     """Solve Eq. 1 for each object, argmin over o of sum_i ||(o - m_i) x n_i|| / ||n_i||, to machine precision.
 
-    Arguments are as in `triangulate`. An object whose rays fix no point gets the point of `least_squares`. For two rays,
-    each point between them on their common perpendicular is optimal, and the result is the midpoint.
+    o is the point, m_i the origin and n_i the direction of ray i. Arguments are as in `triangulate`. An object whose rays
+    fix no point gets the point of `least_squares`. For two rays, each point between them on their common perpendicular is
+    optimal, and the result is the midpoint.
 
     Returns:
         The points (N, 3) m, the number of iterations, and the norm (N,) of the gradient. The norm is NaN if the rays fix no
@@ -277,8 +279,10 @@ def _vector(values: ArrayLike, length: int, name: str) -> Floats:
 
 
 def _positive(values: ArrayLike, length: int, name: str, needed: Floats | None = None) -> Floats:
-    """Return one value per ray. ValueError if a value is not finite and above 0. Where `needed` (R,) is not finite, no value
-    is needed: a wrong value becomes 1."""
+    """Return one value (R,) for each ray. ValueError if a value is not finite and above 0.
+
+    A ray whose `needed` (R,) is not finite needs no value. If its value is wrong, it becomes 1.
+    """
     vector = _vector(values, length, name)
     fine = np.isfinite(vector) & (vector > 0)
     if not (fine if needed is None else fine | ~np.isfinite(needed)).all():
@@ -304,8 +308,10 @@ def _bundle(
 def _sorted_bundle(
     m: Floats, n: Floats, index: Ints, count: int, sigma: Floats, position_sigma: float, backend: Backend
 ) -> tuple[Ints, Tensor, Bundle]:
-    """Return the same as `_bundle`, but with the rays of each object sorted by their distance from its closed-form point. So
-    the input order does not affect which pairs are tried."""
+    """Return the same as `_bundle`, but with the rays of each object sorted by their distance from its closed-form point.
+
+    So the order of the input does not change which pairs are tried.
+    """
     where, base, rays = _bundle(m, n, index, count, sigma, position_sigma, backend)
     xp = rays.xp
     points, _ = least_squares(rays)

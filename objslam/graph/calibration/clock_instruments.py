@@ -1,4 +1,5 @@
-"""Instruments for the offsets of clocks: derivatives with the velocities of the solved path, not with measured ones."""
+"""Instruments for the offsets of clocks. They are derivatives that use the velocities of the solved path instead of measured
+velocities."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,17 +20,18 @@ class ClockInstruments:
 
     If a clock changes, a motion changes by the difference of the velocities at its two ends. In a multiframe, the rays of
     one camera move against those of another. The noise of measured velocities is also in the residuals, so it would bias the
-    clock. The velocities of the solved path do not correlate with the residuals. So the instruments are made of these.
+    clock. The velocities of the solved path do not correlate with the residuals, so the instruments use them.
 
-    All twists have the rotation first. Matrices (..., 6, 6) convert twists or velocities, which are twists per s.
+    A twist has the rotation first (rad), and the translation after it (m). A velocity is a twist per s. Matrices (..., 6, 6)
+    convert twists or velocities.
 
-    moved: for each clock, by the index of its parameter, a mask (K,) of the poses whose images have this clock. moves: (s,),
-    (s,) the poses before and after each motion in the graph. motions: these motions, None without odometry. back: (s, 6, 6)
-    from twists before a motion to twists after it. absolute: (a, 6, 6) from velocities to the rows of absolute poses. first:
-    the first of these rows. before, after: (K,) the two poses from which the velocity at a pose is computed. along: (K, 6,
-    6) from twists of `before` to twists of `after`. seconds: (K,) the time between the two, 0 without a measured motion.
-    to_base: (K, 6, 6) from twists of the camera to twists of base. velocity: (K, 6) the velocities of base on the solved
-    path. across: the rays of cameras that are not the first of their multiframe.
+    moved: for each clock, by the index of its parameter, a mask (K,) of the poses whose images have this clock. moves: (s,)
+    and (s,), the poses before and after each motion in the graph. motions: the s motions, None without odometry. back: (s,
+    6, 6) from twists before a motion to twists after it. absolute: (a, 6, 6) from velocities to the rows of absolute poses.
+    first: the first row of absolute poses. before, after: (K,) the two poses from which the velocity at a pose is computed.
+    along: (K, 6, 6) from twists of `before` to twists of `after`. seconds: (K,) s, the time from `before` to `after`, 0
+    without a measured motion. to_base: (K, 6, 6) from twists of the camera to twists of base. velocity: (K, 6) the
+    velocities of base on the solved path. across: the rays of cameras that are not the first of their multiframe.
     """
 
     moved: Mapping[int, Bools]
@@ -48,7 +50,7 @@ class ClockInstruments:
 
     @classmethod
     def of(cls, of: Linearised, moved: Mapping[int, Bools], motions: Motions | None, across: RaysAcross) -> Self:
-        """Return the instruments of a graph with these motions."""
+        """Return the instruments of a graph. moved, motions, across: as in the class."""
         keyframes, graph = of.measured.keyframes, of.graph
         path = of.map_T_camera @ inverse(keyframes.base_T_camera)
         stamps = np.maximum.accumulate(keyframes.stamps)
@@ -85,8 +87,7 @@ class ClockInstruments:
         self.across.put(instruments, clock, velocity)
 
     def products(self, residual: Floats, clock: int, velocity: Floats) -> Floats:
-        """Return the products (n,) of residuals (M,) with the columns that `put` writes. The columns themselves are not
-        built."""
+        """Return the products (n,) of residuals (M,) with the columns that `put` writes, without building the columns."""
         own = self._own(clock, velocity)
         products = np.zeros(own.shape[2])
         if self.motions is not None:
@@ -103,22 +104,23 @@ class ClockInstruments:
         return np.where(self.moved[clock][:, None, None], velocity, 0.0)
 
     def _changes_of_motions(self, own: Floats) -> Floats:
-        """Return by how much (s, 6, n) velocities (K, 6, n) change the motions."""
+        """Return the changes (s, 6, n) of the motions by velocities (K, 6, n), for a clock change of 1 s."""
         first, last = self.moves
         return np.asarray(own[last] - self.back @ own[first])
 
     def changes(self, poses: Floats) -> Floats:
-        """Return by how much (K, 6, n) the velocities change if the poses change by the twists `poses` (K, 6, n) of the
-        cameras."""
+        """Return the changes (K, 6, n) of the velocities if the camera poses change by the twists `poses` (K, 6, n)."""
         moved = self.to_base @ poses
         change = moved[self.after] - self.along @ moved[self.before]
         return np.asarray(np.where(self.seconds > 0, 1 / np.maximum(self.seconds, 1e-9), 0.0)[:, None, None] * change)
 
 
 def _around(stamps: Floats, measured: Bools, apart: float) -> tuple[Ints, Ints]:
-    """Return the poses (K,), (K,) before and after each pose, at least `apart` away, or the ends of a path without a gap.
+    """Return for each pose the last pose (K,) at least `apart` s before it, and the first pose (K,) at least `apart` s after
+    it.
 
-    stamps: (K,) s. measured: (K-1,) whether the motion to the next pose is measured. apart: s.
+    If such a pose does not exist, the result is the first or last pose that measured motions connect with the pose. stamps:
+    (K,) s. measured: (K-1,) whether the motion to the next pose is measured.
     """
     index = np.arange(len(stamps))
     breaks = np.flatnonzero(~measured)

@@ -1,9 +1,9 @@
 """Measure by how much the shared errors are less certain because noise is correlated.
 
-The gradient by a parameter is a sum over measurements. It is split into sums over clusters, and its variance is the variance
-of these sums. Noise need not be white inside a cluster (cluster-robust covariance; Liang and Zeger 1986). Errors of poses
-are correlated for some seconds, and errors of boxes as long as the robot sees the same thing: a detector draws the box of a
-thing too far to one side, from all places nearby.
+The gradient by a parameter is a sum over measurements. It is split into sums over clusters, and its variance is estimated
+from the squares of the sums. Noise need not be white inside a cluster (cluster-robust covariance; Liang and Zeger 1986).
+Errors of poses are correlated for some seconds. Errors of boxes are correlated as long as the robot sees the same thing,
+because a detector draws the box of a thing too far to one side from all places nearby.
 """
 
 import numpy as np
@@ -17,9 +17,9 @@ from objslam.graph.calibration.variance_components import correlation_time
 def correlation_factors(of: Linearised, system: LinearSystem) -> Floats:
     """Return the factors (P,) >= 1 on the standard deviations of the gradients by the shared errors.
 
-    A factor is the standard deviation from sums over clusters, divided by the standard deviation for white noise. Clusters
-    are windows of `correlation_time` seconds, or all boxes of an object and such windows for all other measurements. The
-    larger factor counts. system: the linear system of the graph `of`.
+    A factor is the standard deviation from sums over clusters, divided by the standard deviation for white noise. Two kinds
+    of clusters are tried, and the larger factor counts. One kind is windows of `correlation_time` seconds. The other kind is
+    all boxes of an object, with windows for all other measurements. system: the linear system of the graph `of`.
     """
     jacobian = system.jacobian
     told = np.column_stack([system.residual, system.instruments, system.sides])
@@ -37,7 +37,8 @@ def correlation_factors(of: Linearised, system: LinearSystem) -> Floats:
 
 
 def _by_object(of: Linearised, system: LinearSystem, window: Ints) -> Ints:
-    """Return the clusters (M,) of rows: one for the bearings and ranges of each object, and after them the windows (M,)."""
+    """Return the cluster (M,) of each row: one for all bearings and ranges of an object, the `window` (M,) for other
+    rows."""
     rays, owner = of.measured.rays.take(of.which), of.association.object[of.which]
     if of.measured.tags is not None:  # The corners of a fiducial err together.
         owner = of.measured.tags.object_of_landmark()[owner]
@@ -49,7 +50,8 @@ def _by_object(of: Linearised, system: LinearSystem, window: Ints) -> Ints:
 
 
 def _seconds(of: Linearised, system: LinearSystem) -> Floats:
-    """Return the time (M,) of each row after the first keyframe, s. It is 0 for landmark priors, absolute poses and tags."""
+    """Return the time (M,), s, of each row since the first keyframe. It is 0 for landmark priors, absolute poses and
+    tags."""
     keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
     stamps = np.maximum.accumulate(keyframes.stamps) - keyframes.stamps[0]
     seen, ranged = stamps[rays.keyframe], np.isfinite(rays.range)

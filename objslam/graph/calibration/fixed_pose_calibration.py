@@ -1,4 +1,4 @@
-"""Estimate the errors that all measurements share at known poses, where the objects are the only other unknowns.
+"""Estimate the errors that all measurements share, at known poses. The objects are the only other unknowns.
 
 A Gauss-Newton step moves the errors and the objects together. Each object is eliminated by its own Schur complement.
 `self_calibration` does the same in joint mode, where poses move too.
@@ -23,28 +23,31 @@ from objslam.graph.calibration.prior_conflict import with_wider_priors
 _ROUNDS = 12
 """The most Gauss-Newton steps. More steps are more exact, and a step is cheap."""
 _CONVERGED = 0.01
-"""An error has converged if its step is below this many posterior standard deviations. A larger number ends sooner."""
+"""The step of an error, in posterior standard deviations, below which the error has converged. A larger step ends sooner."""
 _CAUCHY = 3.0
-"""The deviation, in standard deviations, at which a ray has half of its weight. A larger value gives outliers more
-influence."""
+"""The deviation of a ray, in standard deviations, at which the ray has half of its full weight. A larger value gives
+outliers more influence."""
 _STRETCHES = 50
-"""The number of stretches of the drive that count as independent. Fewer and longer stretches also show errors that are
-correlated over a longer time, but the size of these errors is less exact then."""
+"""The number of stretches of the drive that count as independent. With fewer and longer stretches, errors that are
+correlated over a longer time show too, but the size of such errors is less exact."""
 _FREE = 1e-6
-"""The information (m^-2) added to each object, so that an object without rays is determined too. A larger value moves other
-objects."""
+"""The information (m^-2) that is added to each object, so that even an object whose rays do not fix it is determined. A
+larger value holds other objects back too."""
 
 _RAYS_AT_ONCE = 200_000
 """The most rays that are computed together, counted once for each value of the errors. A larger number takes more memory."""
 
 Noise = tuple[float, float]
-"""The standard deviations of given poses: of headings, rad, and of places, m."""
+"""The standard deviations of the headings (rad) and of the places (m) of given poses."""
 
 
 @dataclass(frozen=True)
 class FixedCalibration:
-    """The shared errors at known poses. sensitivity: (N, 3, P) of the objects, m per unit of each error, 0 for an
-    object without a position."""
+    """The shared errors at known poses.
+
+    sensitivity: (N, 3, P) the derivatives of the objects by the errors, m per unit of each error, 0 for an object without a
+    position.
+    """
 
     calibration: Calibration
     sensitivity: Floats
@@ -54,10 +57,11 @@ class FixedCalibration:
 class PointSystem:
     """The normal equations of the shared errors with the points eliminated. The robust weights are kept fixed.
 
-    matrix: (P, P). vector: (P,) half the gradient of the cost. cost: the sum of the weighted squared deviations. variance:
-    the factor (at least 1) by which the cost exceeds its expectation. curvature: 0 to 1, the mean curvature of Cauchy's loss
-    divided by the mean curvature of the weighted squares. scores: (n, P) the share of each ray in the vector. back: (N, 3,
-    P) the derivative of the points by the errors. own: (N, 3) m, the step of the points with the errors kept fixed.
+    matrix: (P, P) half the curvature of the cost. vector: (P,) half the gradient of the cost. cost: the sum of the weighted
+    squared deviations. variance: the factor (at least 1) by which the cost exceeds its expectation. curvature: 0 to 1, the
+    mean curvature of Cauchy's loss divided by the mean curvature of the weighted squares. scores: (n, P) the part of each
+    ray in the vector. back: (N, 3, P) the derivatives of the points by the errors. own: (N, 3) m, the step of the points
+    with the errors kept fixed.
     """
 
     matrix: Floats
@@ -79,10 +83,11 @@ def calibrate_at_poses(
     *,
     trusted: bool = True,
 ) -> FixedCalibration:
-    """Estimate the shared errors, starting from theta (P,). An error that the rays do not determine stays at its prior.
+    """Estimate the shared errors. The search starts at theta (P,).
 
-    positions: (N, 3) m, the start, NaN for an object without a position, whose rays do not count. noise: of the poses.
-    trusted: as in `linearise_points`. SolveError if the linear system has no single solution.
+    An error that the rays do not determine stays at its prior. positions: (N, 3) m, the objects at the start. An object
+    without a position is NaN, and its rays do not count. noise: the noise of the poses. trusted: as in `linearise_points`.
+    SolveError if the linear system has no single solution.
     """
     held = np.append(np.isfinite(positions[:, 0]), False)[association.object]  # Index -1 (no object) takes the last entry.
     number, owner = np.unique(association.object[held], return_inverse=True)
@@ -123,11 +128,11 @@ def noise_of_errors(errors: CalibratedMeasurements, calibration: Calibration) ->
 def noise_beside_objects(
     errors: CalibratedMeasurements, found: FixedCalibration, association: Association, positions: Floats
 ) -> Floats:
-    """Return the standard deviations (R,), rad, with which rays miss their objects because of the errors that are left.
+    """Return the standard deviations (R,), rad, with which rays miss their objects because the shared errors are uncertain.
 
-    The objects move with the errors, as far as they can: if the camera is turned, all objects turn with it, and their rays
-    still meet. So this is far less than `noise_of_errors` if an error only moves the map. A ray without an object gets the
-    median of the other rays. positions: (N, 3) m at the calibrated errors, NaN for an object without a position.
+    The objects move with the errors. If the camera is turned, all objects turn with it, and their rays still meet. So the
+    result is far less than `noise_of_errors` if an error only moves the map. A ray without an object gets the median of all
+    other rays. positions: (N, 3) m, at the calibrated errors, NaN for an object without a position.
     """
     values, owner = found.calibration.values, association.object
     held = np.append(np.isfinite(positions[:, 0]), False)[owner]  # Index -1 (no object) takes the last entry.
@@ -150,14 +155,14 @@ def noise_beside_objects(
 
 
 def turned_by_errors(errors: CalibratedMeasurements, before: Floats, after: Floats) -> Floats:
-    """Return the small angles (M, R), rad, by which rays in map turn from M values (M, P) of the shared errors to another
-    value (P,)."""
+    """Return the small angles (M, R), rad, between rays in map at M values `before` (M, P) of the shared errors, and the
+    same rays at the value `after` (P,)."""
     _, directions, _ = errors.rays_in_map(np.concatenate([after[None], before]))
     return np.asarray(np.linalg.norm(directions[1:] - directions[0], axis=2))
 
 
 def _batches(number: int, rays: int) -> list[Ints]:
-    """Split a number of steps into batches whose rays are computed together."""
+    """Split the indices of steps into batches whose rays are computed together. rays: the number of rays of a step."""
     return np.array_split(np.arange(number), max(1, -(-number * rays // _RAYS_AT_ONCE)))
 
 
@@ -173,9 +178,9 @@ def linearise_points(
 ) -> PointSystem:
     """Return the normal equations at errors (P,) and points (N, 3).
 
-    held: (R,) the rays that count. owner: (n,) the point of each ray that counts. noise: of the poses. trusted: whether the
-    rays err as the noise says. If they err by far more, as at poses by odometry, their misses must not move points along
-    the rays.
+    held: (R,) a mask of the rays that count. owner: (n,) the point of each ray that counts. noise: the noise of the poses.
+    trusted: whether the rays err as the noise says. If they err by far more, as at poses by odometry, their misses must not
+    move points along the rays.
     """
     target = points[owner]
 
@@ -204,7 +209,7 @@ def linearise_points(
     scores[order] = (left[:, :p] * rows[:, -1:]).reshape(-1, 2, p).sum(axis=1)
     matrix, cost = left[:, :p].T @ left[:, :p], float(left[:, p] @ left[:, p])
     variance = max(1.0, cost / max(2 * len(e) - 3 * n, 1))
-    # For the weight w, the curvature is 2 w^2 - w along a deviation and w across it. The mean is w^2.
+    # Cauchy's loss with the weight w has the curvature 2 w^2 - w along a deviation and w across it. The mean is w^2.
     curvature = float((weight**2).sum() / max(weight.sum(), 1e-300))
     return PointSystem(matrix, scores.sum(axis=0), cost, variance, curvature, scores, moves[..., :p], moves[..., p])
 
@@ -213,9 +218,9 @@ def _dependence(system: PointSystem, keyframe: Ints, prior: Floats) -> float:
     """Return by which factor (at least 1) dependent errors of rays increase the variance of `system.vector`.
 
     Rays of one frame share the error of its pose. Rays of some seconds share the error of the localisation, or of the
-    detector. The sums over stretches of the drive show this (cluster-robust covariance; Liang and Zeger 1986). The largest
-    factor of all shared errors is used. prior: (P, P) information. An error is ignored if its prior has more information
-    than the rays.
+    detector. Sums over stretches of the drive show this dependence (cluster-robust covariance; Liang and Zeger 1986). The
+    result is the largest factor of all shared errors. An error is ignored if its prior has more information than the rays.
+    keyframe: (n,) the keyframe of each ray. prior: (P, P) information.
     """
     told = np.diagonal(system.matrix) > np.diagonal(prior)
     if not told.any():
@@ -229,7 +234,7 @@ def _dependence(system: PointSystem, keyframe: Ints, prior: Floats) -> float:
 def _with_directions(
     errors: CalibratedMeasurements, theta: Floats, held: Bools, map_direction: Floats
 ) -> CalibratedMeasurements:
-    """Return the measurements whose rays `held` (R,) have unit directions (n, 3) in map at errors (P,)."""
+    """Return the measurements, changed so that the rays `held` (R,) have unit directions (n, 3) in map at errors (P,)."""
     rays, direction = errors.rays, errors.rays.direction.copy()
     keyframes, corrected, _ = errors.at(theta, drift=False)
     turns = keyframes.map_T_camera[rays.keyframe[held], :3, :3]
@@ -246,15 +251,15 @@ def _slopes(
 ) -> Floats:
     """Return the derivatives (n, 2, P) of the residuals by the errors, as central differences.
 
-    An error of a camera moves no ray of another camera. So the errors of one kind are moved at once for all cameras
-    (Curtis, Powell and Reid 1974), and each ray shows the error of its own camera.
+    An error of a camera moves no ray of another camera. So the errors of one kind are moved at once for all cameras (Curtis,
+    Powell and Reid 1974), and each ray shows the error of its own camera.
 
     How much a lens or a rotation of the camera turns a ray depends on where the ray lies in the image. At the measured rays,
-    these derivatives would contain the noise of the residuals, and their product would bias the errors (errors in
-    variables; Fuller 1987). So they are taken at the expected rays.
+    such derivatives would contain the noise of the residuals, and their product with the residuals would bias the errors
+    (errors in variables; Fuller 1987). So the derivatives by lenses and rotations are taken at the expected rays.
 
-    measured, expected: return the residuals (M, n, 2) at M values (M, P), of the rays as measured and as expected. camera:
-    (n,) the camera of each ray.
+    measured, expected: functions that return the residuals (M, n, 2) at M values (M, P), of the rays as measured and as
+    expected. camera: (n,) the camera of each ray.
     """
     groups, owner = _moved_together(errors.names, errors.cameras)
     slopes = np.zeros((len(camera), 2, len(theta)))
@@ -275,8 +280,10 @@ def _slopes(
 def _moved_together(
     names: tuple[str, ...], cameras: tuple[str, ...]
 ) -> tuple[tuple[tuple[int, ...], ...], tuple[int | None, ...]]:
-    """Return groups of errors, as indices, and the camera of each error, None if it has none. No two errors of a group move
-    the same ray."""
+    """Return groups of errors, as indices, and the camera of each error. No two errors of a group move the same ray.
+
+    The camera is None for an error that belongs to no camera.
+    """
     owner = [cameras.index(name.rpartition(".")[0]) if name.rpartition(".")[0] in cameras else None for name in names]
     together: dict[str, list[int]] = {}
     for k, name in enumerate(names):
@@ -286,12 +293,12 @@ def _moved_together(
 
 @dataclass(frozen=True)
 class _Misses:
-    """By how much n rays miss their points. The standard deviation of a miss depends on the distance.
+    """The angles by which n rays miss their points. The standard deviation of a miss depends on the distance of the point.
 
     All arrays have a first axis for M values of the errors. deviation: (M, n, 2) the angles between rays and points, in
     standard deviations, along the axes `basis` (M, n, 2, 3). to: (M, n, 3) the unit vectors to the points. distance: (M, n)
-    m. box: (M, n) rad, the noise of the box. angle: (M, n) rad, the noise of directions, which the heading of the pose has
-    too. sigma: (M, n) rad, the noise of misses.
+    m, to the points. box: (M, n) rad, the noise of the box. angle: (M, n) rad, the noise of box and heading together. sigma:
+    (M, n) rad, the noise of misses, with the noise of the place of the pose.
     """
 
     deviation: Floats
@@ -304,7 +311,7 @@ class _Misses:
 
     @classmethod
     def of(cls, origins: Floats, directions: Floats, target: Floats, box: Floats, noise: Noise) -> Self:
-        """Measure rays (M, n, 3) against points `target` (n, 3). box: (M, n) rad, their own noise. noise: of the poses."""
+        """Compare rays (M, n, 3) with points `target` (n, 3), m. box: (M, n) rad. noise: the noise of the poses."""
         to = target - origins
         distance = np.maximum(lengths(to), 1e-3)
         to = to / distance[..., None]
@@ -317,8 +324,11 @@ class _Misses:
 
     @property
     def expected(self) -> Floats:
-        """(M, n, 3) the unit directions of the rays without their own noise. They are turned towards the points by its share
-        of the misses. The noise of poses has the rest, and does not move a ray in its image."""
+        """(M, n, 3) the expected unit directions of the rays, without the noise of their boxes.
+
+        A ray is turned towards its point by the share of its miss that the noise of the box explains. The noise of poses
+        explains the rest, and does not move a ray in its image.
+        """
         turned = self.deviation * self.sigma[..., None] * (self.box / self.sigma)[..., None] ** 2
         direction = cross(self.basis[..., 0, :], self.basis[..., 1, :]) + np.einsum("mnk,mnki->mni", turned, self.basis)
         return np.asarray(direction / lengths(direction)[..., None])
@@ -326,8 +336,8 @@ class _Misses:
     def by_point(self, trusted: bool) -> Floats:
         """Return the derivatives (M, n, 2, 3) of the deviations by the points.
 
-        If the noise is trusted, they contain the derivatives of the standard deviation. Without them, the noise would bias
-        the errors of the camera and the points, and more rays would not reduce this bias.
+        If the noise is trusted, they contain the change of the standard deviation with the distance. Without this part, the
+        noise would bias the errors of the camera and the points, and more rays would not reduce this bias.
         """
         along = self.deviation * self.sigma[..., None] * (self.angle / self.sigma)[..., None] ** 2 * trusted
         across = self.basis - along[..., None] * self.to[..., None, :]

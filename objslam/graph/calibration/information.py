@@ -1,4 +1,4 @@
-"""What a linear system says about the shared errors, after its poses and landmarks are eliminated."""
+"""Compute what a linear system says about the shared errors, after poses and landmarks are eliminated."""
 
 from dataclasses import replace
 
@@ -12,23 +12,23 @@ from objslam.graph.calibration.shared_error_jacobian import ReducedSystem
 from objslam.graph.calibration.shrinkage import force_of_heights, shrinking_force
 
 RIDGE = 1e-9
-"""The share of the variance of a gradient, or of the information, that is added to its diagonal. It prevents a division by
-zero if a log cannot tell two parameters apart. A larger share mixes such parameters more."""
+"""The share of the diagonal of a variance or of an information matrix that is added to this diagonal. It prevents a division
+by zero if a log cannot tell two parameters apart. A larger share mixes such parameters more."""
 _LEAST_GROWTH = 0.5
-"""The common scale is projected out only if the linearised map grows by more than this share when all unknown scales grow by
-1. An exact map would grow by 1. With a larger value, the projection is used more rarely."""
+"""The growth of the linearised map, for a growth of all unknown scales by 1, above which the common scale is projected out.
+An exact map would grow by 1. With a larger value, the projection is used more rarely."""
 _FAR = 3.0
-"""Landmarks up to this multiple of the median distance from the middle of the map show its size. With a larger value, poorly
-determined landmarks count too."""
+"""The largest distance of landmarks that show the size of the map, as a multiple of the median distance from the middle of
+the map. With a larger value, more of the poorly determined landmarks count."""
 
 
 def likelihood(system: ReducedSystem) -> tuple[Floats, Floats]:
     """Return the weights (P, P) of the system's gradient, and the information (P, P) that it has about the parameters.
 
-    The gradient g is Gaussian: its mean is the slope C times the error of the parameters, and V is its variance. So the
+    The gradient is Gaussian. Its mean is the slope C times the error of the parameters, and its variance is V. So the
     weights are C' V^-1 and the information is C' V^-1 C (limited information likelihood; Kim 2002). If the derivatives by
-    the parameters have no noise, the weights are 1 and the information is C. If they are only noise, V is large, C is small,
-    and the parameters stay at their prior. SolveError if the system is not finite.
+    the parameters have no noise, the weights are 1 and the information is C. If the derivatives are only noise, V is large,
+    C is small, and the parameters stay at their prior. SolveError if the system is not finite.
     """
     variance, slope = system.variance, system.slope
     if not (np.isfinite(variance).all() and np.isfinite(slope).all()):
@@ -44,8 +44,8 @@ def covariance_of(system: ReducedSystem, prior: Floats, wider: Floats) -> Floats
     """Return the covariance (P, P) of the parameters, at most the covariance of their prior in every direction.
 
     prior: (P, P) information. wider: (P,) factors on the standard deviations of the gradient, for noise that is not white.
-    They are known only roughly. So they only widen the result, by the sandwich formula (Huber 1967), and the weights stay as
-    for white noise.
+    The factors are known only roughly. So they only widen the result, by the sandwich formula (Huber 1967), and the weights
+    stay those for white noise.
     """
     weights, information = likelihood(system)
     inverse = np.linalg.inv(information + prior)
@@ -62,9 +62,9 @@ def without_shrinking(
     """Return the system without the force that makes a solution too small, because this force would move the parameters.
 
     The more the size of the map depends on a parameter, the more the force acts on the parameter. If all lengths have an
-    unknown scale, everything can grow in proportion at no cost. Then nothing but the force determines the common scale. So
+    unknown scale, everything can grow in proportion at no cost, and nothing but the force determines the common scale. So
     the common scale is projected out (the gauge of a free network; Meissl 1969). If some length is known, the force is
-    computed and subtracted.
+    computed and removed from the gradient. theta: (P,) the shared errors.
     """
     landmarks = state.positions[state.landmarks]
     if not len(landmarks):

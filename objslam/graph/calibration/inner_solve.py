@@ -1,4 +1,4 @@
-"""The inner solve of a calibration: poses and landmarks at given shared errors."""
+"""The inner solve of a calibration. It finds poses and landmarks at given shared errors."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,17 +17,19 @@ from objslam.graph.outlier_rejection import Near, order_near, supported
 from objslam.graph.variables import read_poses, with_points
 
 _INNER = 4
-"""The most steps of an inner solve. Few are enough, because it begins at a linear prediction of its optimum."""
+"""The most steps of an inner solve. Few steps are enough, because the solve begins at a linear prediction of its optimum.
+More steps are more exact and slower."""
 _TOLERANCE = 1e-4
-"""An inner solve ends if the next step would decrease the cost by less than this share. A larger share ends it sooner."""
+"""The relative decrease of the cost below which an inner solve ends, as the next step predicts it. A larger share ends the
+solve sooner."""
 
 
 @dataclass(frozen=True)
 class InnerSolve(Linearised):
-    """A graph for given parameters, with its variables near their optimum.
+    """A graph for given parameters, with its variables near their optimum. It is called a state here.
 
-    stale: the factorised normal equations of a state nearby, for the steps. None means that the state uses its own. A step
-    with stale equations takes a fifth of the time, because no matrix is built and factorised.
+    stale: the factorised normal equations of another state nearby, which the next step uses. None means that the state uses
+    its own equations. A step with stale equations takes a fifth of the time, because no matrix is built and factorised.
     """
 
     stale: Equations | None = None
@@ -44,7 +46,7 @@ class InnerSolve(Linearised):
 
     @cached_property
     def gradient(self) -> Floats:
-        """(D,) of the cost."""
+        """(D,) the gradient of the cost by the variables."""
         return self.rows.jacobian.T @ self.rows.residual
 
     @cached_property
@@ -58,7 +60,7 @@ class InnerSolve(Linearised):
         return float(-self.gradient @ self.step) / 2
 
     def ordered(self, near: Near | None) -> Self:
-        """Return the state with the order of elimination, which all later states share.
+        """Return the state with an order of elimination. All states that are made from it share this order.
 
         near: an earlier solve. If it had the same variables, its order is taken.
         """
@@ -80,7 +82,10 @@ class InnerSolve(Linearised):
         )
 
     def predicted(self, system: ReducedSystem, step: Floats, measured: Measurements) -> Self:
-        """Return the linear prediction of the optimum for other measurements, after a step (P,) of the parameters."""
+        """Return the linear prediction of the optimum after a step (P,) of the parameters.
+
+        measured: the measurements at the parameters after the step.
+        """
         moved = self.moved(system.sensitivity @ step + system.newton)
         return replace(moved, stale=self.normal).measuring(measured)
 
@@ -91,9 +96,9 @@ class InnerSolve(Linearised):
     def solved(self) -> Self:
         """Return the state after at most `_INNER` steps, or `_damped` if a step does not lower the cost.
 
-        A step takes the normal equations of the previous step (chord method). Between steps, only the robust weights and the
-        directions change a little. The gradient is fresh, so the steps lead to the same optimum as steps of Gauss-Newton. If
-        a chord step does not lower the cost, the step is taken with fresh normal equations instead.
+        A step uses the normal equations of the previous step (chord method). Between steps, only the robust weights and the
+        directions change a little. The gradient is fresh, so the steps lead to the same optimum as Gauss-Newton steps. A
+        chord step that does not lower the cost is replaced by a step with fresh normal equations.
         """
         state = self
         for _ in range(_INNER):
@@ -120,6 +125,6 @@ class InnerSolve(Linearised):
         return replace(self, map_T_camera=read_poses(found), positions=with_points(self.positions, landmarks, found))
 
     def settled(self) -> Self:
-        """Return the state with the rays that now agree with their objects."""
+        """Return the state in which those rays are used that agree with their objects at the present values."""
         used = supported(self.measured.rays, self.association, self.map_T_camera, self.positions, self.used)
         return self if np.array_equal(used, self.used) else replace(self, used=used, known=None)

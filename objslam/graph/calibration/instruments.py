@@ -1,7 +1,7 @@
-"""Instruments for the scales of the odometry: the neighbours of a motion predict it without its own noise.
+"""Instruments for the scales of the odometry. The neighbours of a motion predict the motion without its own noise.
 
-An instrument replaces a derivative whose noise is also in the residuals. It follows the derivative, but its own errors do
-not correlate with the residuals, so the estimate has no bias (instrumental variables).
+An instrument replaces a derivative whose noise is also in the residuals. It correlates with the derivative, but its own
+errors do not correlate with the residuals. So the estimate has no bias (instrumental variables).
 """
 
 from collections.abc import Sequence
@@ -16,25 +16,28 @@ from objslam.core.types import Keyframes
 from objslam.graph.calibration.linearised_graph import Linearised
 
 ODOMETRY_SCALES = ("odometry.scale", "odometry.lateral_scale", "odometry.turn_scale")
-"""Each derivative by one of these parameters consists of measured motions, and so contains the odometry's noise."""
+"""The names of the parameters that scale the odometry. The derivatives by them are measured motions, and so contain the
+noise of the odometry."""
 _ALIKE = 3.0
-"""The largest ratio between the variances that neighbours predict and the variances of the motion itself, in both
-directions. With a larger ratio, motions that differ from their neighbours make the parameters less certain: with 10, the
-clock of a robot that often stands had a standard deviation five times as large. With a smaller ratio, the noise of a motion
-changes its weight."""
+"""The largest ratio of the variances that neighbours predict to the variances of the motion itself. The inverse ratio has
+the same limit. With a larger limit, motions that differ from their neighbours make the parameters less certain. With 10, the
+clock of a robot that often stands had a standard deviation five times as large. With a smaller limit, the noise of a motion
+changes the weight of the motion."""
 _MOMENT = 0.025
-"""Frames of several cameras within this time (s) are of one moment: they are too near each other to show how fast the robot
-moves. A larger value takes velocities and the neighbours of motions from a longer time, and so loses short turns."""
+"""The time (s) within which frames of several cameras belong to one moment. Such frames are too close in time to show how
+fast the robot moves. With a larger value, velocities and the neighbours of motions come from a longer time, so short turns
+are lost."""
 
 
 @dataclass(frozen=True)
 class Motions:
-    """The measured motions in the graph: s twists of base, with the rotation first.
+    """The s measured motions in the graph, as twists of base with the rotation (rad) first and the translation (m) after it.
 
-    to_twist: (s, 6, 6) from the whitened rows of a motion to its twist. to_rows: (s, 6, 6) back. weight: (s,) robust.
-    covariance: (s, 6, 6) of the twists, as the neighbours of each motion predict it. by_odometry: (s, 6) the share of the
-    odometry in their standard deviations. The rest comes from the interpolated path. seconds: (s,) durations. rows: of the
-    motions in the linear system. tied: as in `OdometryMotions`. moment: s, as in `from_neighbours`.
+    to_twist: (s, 6, 6) from the whitened rows of a motion to its twist. to_rows: (s, 6, 6) from the twist to the rows.
+    weight: (s,) the robust weights. covariance: (s, 6, 6) of the twists, as the neighbours of each motion predict it.
+    by_odometry: (s, 6) the share of the odometry in the standard deviations of a twist. The rest comes from the interpolated
+    path. seconds: (s,) s, the durations. rows: the rows of the motions in the linear system. tied: as in `OdometryMotions`.
+    moment: s, as in `from_neighbours`.
     """
 
     to_twist: Floats
@@ -77,29 +80,33 @@ class Motions:
         return np.asarray((self.to_rows @ twists).reshape(6 * len(twists), twists.shape[2]))
 
     def predicted(self, twists: Floats) -> Floats:
-        """Return the twists (s, 6, n) that neighbours predict for twists (s, 6, n)."""
+        """Return the prediction (s, 6, n) of twists (s, 6, n) by their neighbours."""
         return from_neighbours(twists.reshape(len(twists), -1), self.seconds, self.moment).reshape(twists.shape)
 
     def weighted(self, twists: Floats) -> Floats:
-        """Return the rows (6 s, n) whose product with the residuals weighs twists (s, 6, n) by the covariance."""
+        """Return the rows (6 s, n) of twists (s, 6, n) that are weighted by the inverse of `covariance`.
+
+        The product of a row with the residuals is the weighted product of a twist with the residual twist.
+        """
         weighted = self.weight[:, None, None] ** 2 * np.linalg.solve(self.covariance, twists)
         return np.asarray((np.swapaxes(self.to_twist, 1, 2) @ weighted).reshape(6 * len(twists), twists.shape[2]))
 
 
 def motion_instruments(motions: Motions | None, names: Sequence[str], sides: Floats) -> Floats:
-    """Return instruments (M, p). They are the `LinearSystem.sides` without the noise of single motions.
+    """Return instruments (M, P). They are the `LinearSystem.sides` (M, P) without the noise of single motions.
 
-    The noise of a motion is both in its derivative by a scale of the odometry and in its residual. Their product would bias
-    the scale: upwards if the odometry is measured, downwards if it is a command to the robot. The neighbours move alike, and
-    their noise is independent. So they predict the derivative (instrumental variables; Fuller 1987, 1.4).
+    The noise of a motion is both in its derivative by a scale of the odometry and in its residual. The product of the two
+    would bias the scale upwards if the odometry is measured, and downwards if it is a command to the robot. The neighbours
+    of a motion are like it, and their noise is independent. So they predict the derivative (instrumental variables; Fuller
+    1987, 1.4).
 
     The noise is also in the weight of a motion, because longer motions have more noise. So motions that were measured too
-    short would weigh more, and bias the errors of the odometry. Hence the neighbours also predict the covariance for these
-    errors. The prediction has limits (`_ALIKE`), because a motion between two stops differs from its neighbours. The
-    derivatives by other errors do not point along the noise that changes the weight.
+    short would weigh more, and bias the errors of the odometry. Hence the neighbours also predict the covariance for the
+    errors of the odometry. The prediction has limits (`_ALIKE`), because a motion between two stops differs from its
+    neighbours. The derivatives by other errors do not point along the noise that changes the weight.
 
-    The odometry also moves the cameras of a multiframe against each other, if their clocks differ. These short motions are
-    mostly noise, and tell next to nothing about the odometry. So the instruments leave the rays out.
+    If the clocks of the cameras of a multiframe differ, the odometry also moves these cameras against each other. Such short
+    motions are mostly noise, and tell next to nothing about the odometry. So the instruments leave the rays out.
     """
     instruments = sides.copy()
     own = [k for k, name in enumerate(names) if name.startswith("odometry.")]
@@ -113,7 +120,10 @@ def motion_instruments(motions: Motions | None, names: Sequence[str], sides: Flo
 
 
 def _alike(near: Floats, covariance: Floats) -> Floats:
-    """Return covariances (s, 6, 6) like `near`, but with variances that differ from `covariance` at most by `_ALIKE`."""
+    """Return covariances (s, 6, 6) like `near`, but with variances that differ from `covariance` at most by `_ALIKE`.
+
+    near, covariance: (s, 6, 6).
+    """
     root = np.linalg.cholesky(covariance)
     back = np.linalg.inv(root)
     size, axes = np.linalg.eigh(back @ near @ np.swapaxes(back, 1, 2))
@@ -122,17 +132,18 @@ def _alike(near: Floats, covariance: Floats) -> Floats:
 
 
 def moment_of(keyframes: Keyframes) -> float:
-    """Return the time, s, over which keyframes are of one moment: `_MOMENT` with several cameras, else 0."""
+    """Return the time, s, within which keyframes belong to one moment. It is `_MOMENT` with several cameras, else 0."""
     return _MOMENT if len(keyframes) and np.ptp(keyframes.camera) > 0 else 0.0
 
 
 def from_neighbours(motions: Floats, seconds: Floats, moment: float) -> Floats:
-    """Predict each of the motions (n, D) from its own duration and the rate of motions near it: two before, two after.
+    """Return a prediction (n, D) of each motion (n, D): its own duration times the rate of two motions before and two after
+    it.
 
-    The motions directly beside it do not count: they may share a step of the odometry with it, and so its noise. The frames
-    of several cameras may be milliseconds apart. Then more motions do not count, and more count. seconds: (n,) the
-    durations. moment: s. Motions over this time beside a motion are of the same moment. On each side, the neighbours last
-    three times as long at least.
+    The motion directly before it and the one directly after it do not count, because they may share a step of the odometry
+    with it, and so share its noise. The frames of several cameras may be milliseconds apart. So on each side, all motions
+    within `moment` s of the motion do not count, and the neighbours that count last at least three times as long as
+    `moment`. seconds: (n,) s, the durations.
     """
     count = len(motions)
     ends = np.append(0.0, np.cumsum(seconds))
@@ -147,9 +158,10 @@ def from_neighbours(motions: Floats, seconds: Floats, moment: float) -> Floats:
 
 
 def _after(ends: Floats, moment: float) -> tuple[Ints, Ints]:
-    """Return for each of n motions the first of the motions that follow it and count, and the one after the last of them.
+    """Return for each of n motions the index (n,) of the first later motion that counts, and the index (n,) after the last
+    one.
 
-    ends: (n+1,) s, the begin of the first motion, and the ends of all. moment: s, as in `from_neighbours`.
+    ends: (n+1,) s, the start of the first motion, followed by the ends of all motions. moment: s, as in `from_neighbours`.
     """
     count = len(ends) - 1
     first = np.maximum(np.arange(count) + 2, np.searchsorted(ends[:-1], ends[1:] + moment))

@@ -16,9 +16,9 @@ from objslam.graph.least_squares.normal_equations import Equations, factored
 class Linearised:
     """The graph of a joint solve with Huber's loss, and values of its variables.
 
-    map_T_camera: (K, 4, 4). positions: (N, 3) m, NaN for a landmark outside the graph. used: (R,) the rays in the graph.
-    order: (D,) the order in which the columns of the Jacobian are eliminated. known: the graph, which states with the same
-    measurements share. None means that they are not known yet.
+    map_T_camera: (K, 4, 4). positions: (N, 3) m in map, NaN for a landmark outside the graph. used: (R,) a mask of the rays
+    in the graph. order: (D,) the order in which the columns of the Jacobian are eliminated. known: the graph, which states
+    with the same measurements share. For `order` and `known`, None means not known yet.
     """
 
     measured: Measurements
@@ -31,24 +31,24 @@ class Linearised:
 
     @property
     def which(self) -> Ints:
-        """(n,) the rays in the graph."""
+        """(n,) the indices of the rays in the graph."""
         return np.flatnonzero(self.used)
 
     @property
     def landmarks(self) -> Ints:
-        """(m,) the landmarks in the graph."""
+        """(m,) the indices of the landmarks in the graph."""
         return np.flatnonzero(np.isfinite(self.positions[:, 0]))
 
     @cached_property
     def graph(self) -> JointGraph:
-        """The graph. The weak priors of landmarks have as means the `positions` at which the graph was made."""
+        """The graph. The means of the weak priors of landmarks are the `positions` at which the graph was made."""
         if self.known is not None:
             return self.known
         return JointGraph.of(self.measured, self.association, self.used, self.positions)
 
     @cached_property
     def rows(self) -> JointRows:
-        """The rows of the graph at the values."""
+        """The rows of the graph at the values of its variables."""
         return self.graph.rows(self.map_T_camera, self.positions[self.landmarks])
 
     @cached_property

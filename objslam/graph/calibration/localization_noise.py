@@ -1,9 +1,9 @@
 """Estimate the noise of a localisation, and how long its errors last, from the rest of the log.
 
-Odometry and rays predict the path, up to a shift and a turn of the whole. The localisation differs from this prediction by
-the error of the prediction, whose covariance the graph knows, and by its own error. Three values of its own error are
-estimated by restricted maximum likelihood (Patterson and Thompson 1971): its size, the share of it that lasts, and how long
-this share lasts.
+Odometry and rays predict the path, up to a shift and a turn of the whole path. The localisation differs from this prediction
+by its own error and by the error of the prediction. The graph gives the covariance of the error of the prediction. Three
+values of the error of the localisation are estimated by restricted maximum likelihood (Patterson and Thompson 1971): its
+size, the share of it that lasts, and how long this share lasts.
 """
 
 from dataclasses import replace
@@ -28,30 +28,33 @@ from objslam.graph.factors.localization import localized, sharing
 from objslam.graph.multiframes import Multiframes
 
 _LOOSE = 1e4
-"""In the graph that predicts the localised poses, their noise is multiplied by this factor, so that they hardly count. With
-a larger factor, the prediction contains less of the localisation, and more rounding errors."""
+"""The factor on the noise of localised poses in the graph that predicts them. The factor is large, so that the localised
+poses hardly count there. With a larger factor, the prediction contains less of the localisation, and more rounding
+errors."""
 _FIRST, _LAGS = 18, (0, 1, 2, 4, 8, 16)
-"""In a long log, the compared poses are at `_FIRST` keyframes, evenly spread, and `_LAGS` keyframes after each of them.
-Poses close together show errors that are new in each pose, and poses far apart show errors that last. More poses are more
-exact, and the time grows with the cube of their number."""
+"""The number of evenly spread places in a long log at which localised poses are compared, and the lags of the poses compared
+at each place. A lag is a number of localised poses. Poses close together show errors that are new in each pose, and poses
+far apart show errors that last. With more poses, the noise is more exact, and the time grows with the cube of their
+number."""
 _MOST_STRAYS = 0.1
-"""At most this share of the poses are jumps. A larger share explains noise by jumps."""
+"""The largest share of the compared poses that may count as jumps of the localisation. With a larger share, noise is taken
+for jumps."""
 _KEPT = 64
-"""For how many logs' paths the noise is kept. A run that compares the same two paths again, as its checks do, then searches
-once. A larger number takes more memory, some hundred bytes each."""
+"""The number of comparisons whose result is kept. So a run that compares the same two paths again, as its checks do,
+searches only once. A larger number takes more memory, some hundred bytes for each comparison."""
 
 _kept = dict[bytes, "_Noise"]()
 _lock = Lock()
 
 _Noise = tuple[tuple[float, Lasting], tuple[float, Lasting]]
-"""The factors on the noise of headings and places, and their lasting parts."""
+"""The factor on the noise and the lasting part, first of headings, and second of places."""
 
 
 def noise_of_localization(rest: Linearised, errors: CalibratedMeasurements, theta: Floats) -> NoiseFactors:
-    """Return `errors.noise` with the noise of the localisation that agrees best with the rest of a graph at its values.
+    """Return `errors.noise` with the noise of the localisation that agrees best with the rest of the graph.
 
-    Factors are at least 1. They are 1 if the log agrees with the settings. rest: the graph, `without_localization`. theta:
-    (P,) the shared errors. SolveError if the rest is singular.
+    The factors on the noise are at least 1. They are 1 if the log agrees with the settings. rest: the graph, as
+    `without_localization` returns it. theta: (P,) the shared errors. SolveError if the rest is singular.
     """
     (heading, turned), (place, shifted) = _noise_in(_compared(rest, errors, theta))
     return replace(
@@ -66,10 +69,10 @@ def noise_of_localization(rest: Linearised, errors: CalibratedMeasurements, thet
 
 
 def noise_of_paths(errors: CalibratedMeasurements, theta: Floats) -> NoiseFactors:
-    """Return `errors.noise` with the noise of the localisation that agrees best with the odometry alone, before any ray has
-    an object.
+    """Return `errors.noise` with the noise of the localisation that agrees best with the odometry alone.
 
-    theta: (P,) the shared errors. If the odometry does not determine the path, the noise stays as it is.
+    This is for a log whose rays have no objects yet. theta: (P,) the shared errors. If the odometry does not determine the
+    path, the noise stays as it is.
     """
     keyframes, rays, settings = errors.at(theta)
     measured = Measurements.of(keyframes, rays, settings, Multiframes.of(errors.keyframes))
@@ -83,7 +86,7 @@ def noise_of_paths(errors: CalibratedMeasurements, theta: Floats) -> NoiseFactor
 
 
 def _noise_in(data: ComparedPoses) -> _Noise:
-    """Return the noise of headings and places that agrees best with the data. That of the same data is kept."""
+    """Return the noise of headings and places that agrees best with the data. The result is kept for the same data."""
     key = _digest(data)
     with _lock:
         if key in _kept:
@@ -102,14 +105,17 @@ def _noise_in(data: ComparedPoses) -> _Noise:
 
 
 def _digest(data: ComparedPoses) -> bytes:
-    """Return a digest of all values, which is the same for the same data."""
+    """Return a hash of all values of the data. It is the same for the same data."""
     arrays = (np.ascontiguousarray(one) for one in (data.off, data.covariance, data.shared, data.times))
     rest = repr((data.apart, data.nominal, data.free, data.prior)).encode()
     return sha256(b"".join(one.tobytes() for one in arrays) + rest).digest()
 
 
 def _without_jumps(data: ComparedPoses, model: PoseErrors) -> Ints:
-    """Return the poses (m,) that agree with what all other poses predict, or all poses if too many disagree."""
+    """Return the indices (m,) of the poses that agree with their prediction by all other poses.
+
+    If too many poses disagree (`_MOST_STRAYS`), all poses are returned.
+    """
     inner = np.linalg.inv(data.expected(model))
     n = len(data.times)
     at = np.arange(n)[:, None] + n * np.arange(3)
@@ -120,7 +126,10 @@ def _without_jumps(data: ComparedPoses, model: PoseErrors) -> Ints:
 
 
 def _compared(rest: Linearised, errors: CalibratedMeasurements, theta: Floats) -> ComparedPoses:
-    """Return the localisation against a prediction by the rest of the graph, `without_localization`."""
+    """Return the comparison of localised poses with their prediction by the rest of the graph.
+
+    rest: the graph, as `without_localization` returns it. theta: (P,) the shared errors.
+    """
     system, keyframes, nominal = linearise(rest, errors, theta), rest.measured.keyframes, errors.settings.localization
     poses = _poses(keyframes)
     map_T_base = (rest.map_T_camera @ inverse(keyframes.base_T_camera))[poses]
@@ -160,7 +169,7 @@ def _compared(rest: Linearised, errors: CalibratedMeasurements, theta: Floats) -
 
 
 def without_localization(of: Linearised) -> Linearised:
-    """Return the graph at the same values, in which the localisation hardly counts."""
+    """Return the graph at the same values, but with so much noise of the localisation that it hardly counts."""
     measured = replace(of.measured, keyframes=_white(of.measured.keyframes), settings=_without_places(of.measured.settings))
     return replace(of, measured=measured, known=None)
 

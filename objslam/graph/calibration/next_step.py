@@ -1,6 +1,7 @@
-"""What a joint solution shows about the shared errors that it held, and what these errors do to it.
+"""Show from a joint solution whether the shared errors that it held are large, and how far they may move the landmarks.
 
-One outer step of `self_calibration` is enough to see whether a held error is large. It takes a tenth of the time of a solve.
+A solution holds an error if it does not estimate this error. One outer step of `self_calibration` is enough to see whether a
+held error is large. The step takes a tenth of the time of a solve.
 """
 
 from dataclasses import dataclass, replace
@@ -23,10 +24,11 @@ from objslam.graph.multiframes import Multiframes
 
 @dataclass(frozen=True)
 class NextStep:
-    """The Gauss-Newton step of the shared errors from a solution.
+    """The next Gauss-Newton step of the shared errors after a joint solution.
 
-    errors: the estimated and the held errors of the same keyframes and rays, at the noise of the solution. theta: (P,) their
-    values in the solution. state: the solution. reduced: its linear system, with poses and landmarks eliminated.
+    errors: the estimated and the held errors of the same keyframes and rays, at the noise of the solution. theta: (P,) the
+    values of all errors in the solution. state: the solution. reduced: the linear system of the solution, with poses and
+    landmarks eliminated.
     """
 
     errors: CalibratedMeasurements
@@ -36,7 +38,7 @@ class NextStep:
 
     @classmethod
     def of(cls, errors: CalibratedMeasurements, association: Association, estimate: Estimate, theta: Floats) -> Self:
-        """Linearise a solution. SolveError if its linear system is singular."""
+        """Linearise the solution `estimate` at the shared errors theta (P,). SolveError if its linear system is singular."""
         multiframes = Multiframes.of(errors.keyframes)
         keyframes, rays, settings = errors.at(theta)
         ties = find_ties(multiframes.keyframes(keyframes), settings)
@@ -48,7 +50,8 @@ class NextStep:
         return cls(errors, theta, state, linearise(state, errors, theta).reduce())
 
     def only(self, errors: CalibratedMeasurements) -> Self | None:
-        """Return the step of some of the errors. None if another error is not 0, because it changes the measurements."""
+        """Return the step of some of the errors. Return None if another error is not 0, because it changes the
+        measurements."""
         columns = np.array([self.errors.names.index(name) for name in errors.names], dtype=np.int64)
         if np.delete(self.theta, columns).any():
             return None
@@ -57,28 +60,28 @@ class NextStep:
     def predicted(self) -> Calibration:
         """Return the shared errors after the step, with their covariance.
 
-        A held error bends the path, so it correlates the residuals, and its effect on the odometry looks like noise. So the
-        step treats the residuals as white noise. Otherwise the step would be only a third as long. The covariance is also
-        that of white noise. SolveError if the linear system is not finite.
+        A held error bends the path. This correlates the residuals, and looks like noise of the odometry. So the step treats
+        the residuals as white noise. Otherwise the step would be only a third as long. The covariance also assumes white
+        noise. SolveError if the linear system is not finite.
         """
         step, covariance = self._step(self._without_shrinking())
         return Calibration(self.errors.names, self.theta + step, covariance, np.sqrt(np.diagonal(self.errors.prior)))
 
     def moved_by(self, held: Bools) -> Floats:
-        """Return how far the H held errors may move the N landmarks: a factor (N, 3, H), m, of their joint covariance
-        (consider covariance; Schmidt 1966).
+        """Return the moves (N, 3, H), m, of the N landmarks if each of the H held errors changes by one standard deviation.
 
-        If a held error is wrong, the estimated errors follow it and take up a part of it. The variance of a held error is
-        that of its prior. The data would give a smaller one, but their noise is not white and bends the path as a held error
-        does. The square of the step is added, because the solution does not take this step. Landmarks outside the graph do
-        not move.
+        The moves F, with the landmarks as rows, give the joint covariance F F^T of the landmarks due to the held errors
+        (consider covariance; Schmidt 1966). If a held error is wrong, the estimated errors take up a part of it. The
+        variance of a held error is that of its prior, plus the square of the step, because the solution does not take this
+        step. The data would give a smaller variance, but their noise is not white, and bends the path as a held error does.
+        Landmarks outside the graph do not move.
 
         held: (P,) the mask of the errors that the solution held. SolveError as in `predicted`.
         """
         errors, state, reduced = self.errors, self.state, self._without_shrinking()
         step, _ = self._step(reduced)
         free, slope = ~held, reduced.slope
-        # The solve weighed the gradients by the estimated errors alone, without those by the held ones.
+        # The solve used only the gradients by the estimated errors, and not the gradients by the held errors.
         own = np.ix_(free, free)
         weights, information = likelihood(replace(reduced, slope=slope[own], variance=reduced.variance[own]))
         curvature = information + np.linalg.inv(errors.prior[own])

@@ -1,4 +1,4 @@
-"""The noise of the odometry in the derivatives by scales and clocks."""
+"""Estimate the noise of the odometry in the derivatives by scales and clocks."""
 
 from collections.abc import Callable
 
@@ -14,33 +14,35 @@ from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem
 
 _AXES_OF = {"odometry.scale": (3, 4), "odometry.lateral_scale": (4,), "odometry.turn_scale": (2,)}
-"""The components of a twist that each scale parameter multiplies."""
+"""The indices of the components of a twist that each scale parameter multiplies."""
 _PROBES = 4
 """The number of random probes. More probes are more exact and slower. With 4, the error of a product is a small part of the
 standard deviation of the gradient."""
 
 
 def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasurements) -> Floats:
-    """Return for each shared error (P,) the share of its information that comes from noise of the odometry.
+    """Return the shares (P, P) of the information about the shared errors that come from noise of the odometry.
 
-    Only clocks and the scales of the odometry have such noise, because their sides (`LinearSystem.sides`) contain measured
-    motions. A side without its best fit by poses and landmarks (`LinearSystem.left`) is called the rest of the side here.
-    The information is the sum of the squares of this rest.
+    The shares of scales are on the diagonal, and the shares of clocks are a block (`_shares`). Only clocks and the scales of
+    the odometry have such noise, because their sides (`LinearSystem.sides`) contain measured motions. A side without its
+    best fit by poses and landmarks (`LinearSystem.left`) is called the rest of the side here. The information is the sum of
+    the squares of this rest.
 
     For a scale, the noise in the information is the expected product of two noises: that of its instrument, and that of the
-    rest of its side. The instrument has the noise of the neighbours of each motion. It is independent of the noise of the
-    motion itself, but the fit by poses spreads the noise of a motion over its neighbours. For a clock, the noise in the
-    information is the expected square of the noise in the rest of its side.
+    rest of its side. The instrument has the noise of the neighbours of each motion. This noise is independent of the noise
+    of the motion itself, but the fit by poses spreads the noise of a motion over its neighbours. For a clock, the noise in
+    the information is the expected square of the noise in the rest of its side.
 
-    These expectations are traces of matrices, which random probes estimate (Hutchinson 1990). A probe is a random walk with
+    Both expectations are traces of matrices, which random probes estimate (Hutchinson 1990). A probe is a random walk with
     steps at the stamps of the odometry, because keyframes between two stamps share a step.
 
-    The size of the noise is the smaller of two: the roughness of the measured motions, and the residuals of the solution.
-    Motions that were commanded and not measured are smooth. Their residuals come from the robot, so the sides have no noise.
+    The roughness of the measured motions and the residuals of the solution each give a size of the noise. The smaller size
+    counts. Motions that were commanded and not measured are smooth. Their residuals come from the robot, so the sides have
+    no noise.
 
-    The share of a clock is at least the share of the motions that are below ties (`Motions.tied`). For these motions, the
+    The share of a clock is at least the share of the motions that are below ties (`Motions.tied`). For such motions, the
     solved path is the instrument of clocks, for the following reason. An interpolated pose averages the noise of two poses
-    of the odometry, so it has less noise midway between them. A clock offset that moves the ends of ties there therefore
+    of the odometry, so it has less noise midway between them. So a clock offset that moves the ends of ties to the middle
     seems to fit better. For motions between keyframes, this effect cancels, because keyframes lie anywhere in a step. But
     all ties end at about the same share of a step if the rates of images and odometry have a simple ratio. On simulated
     wheels that slip, with one pose in a second, this moved a clock by 0.09 s.
@@ -63,7 +65,7 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
         rate = mine[:, None] * at_poses[k]
         rates[k] = rate[after] - rate[before]
     of_pose = np.zeros((len(stamps), 6))
-    of_pose[before], of_pose[after] = sigma, sigma  # The noise around a pose is that of a motion at it.
+    of_pose[before], of_pose[after] = sigma, sigma  # The noise around a pose is that of a motion that starts or ends there.
     odometry = of.measured.keyframes.odom_T_base
     assert odometry is not None
     said = log_se3(inverse(odometry[before]) @ odometry[after]) / sigma
@@ -110,9 +112,9 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
 def _shares(noise: Floats, information: Floats, least: float) -> Floats:
     """Return the shares (C, C) of noise in the information about C clocks, between `least` and 1 in each direction.
 
-    noise, information: (C, C). The noise is information @ shares. The frames of several cameras have the same odometry, so
-    their clocks share its noise: it hardly disturbs the difference of two clocks, but it does disturb their mean. SolveError
-    if a number is not finite.
+    noise, information: (C, C). The product of information and shares is the noise, except for the limits. The frames of
+    several cameras have the same odometry, so their clocks share its noise. This noise hardly disturbs the difference of two
+    clocks, but it disturbs their mean. SolveError if a number is not finite.
     """
     size = np.sqrt(np.maximum(np.diagonal(information), 1e-300))
     told, told_noise = information / np.outer(size, size), noise / np.outer(size, size)
@@ -126,7 +128,7 @@ def _shares(noise: Floats, information: Floats, least: float) -> Floats:
 
 
 def _random_walks(stamps: Floats) -> Callable[[Floats], Floats]:
-    """Return a function of times (n,), s, that gives random walks (n, probes). Their steps are at `stamps` (m,), s."""
+    """Return a function from times (n,), s, to the values (n, probes) of random walks with steps at `stamps` (m,), s."""
     rng = np.random.default_rng(0)
     steps = rng.standard_normal((len(stamps) - 1, _PROBES)) * np.sqrt(np.maximum(np.diff(stamps), 0.0))[:, None]
     walks = np.vstack([np.zeros((1, _PROBES)), np.cumsum(steps, axis=0)])
@@ -134,7 +136,7 @@ def _random_walks(stamps: Floats) -> Callable[[Floats], Floats]:
 
 
 def _roughness(values: Floats, motions: Motions) -> float:
-    """Return the median difference between values (n, D) of the motions and their prediction by neighbours."""
+    """Return the median absolute difference between values (n, D) of motions and their prediction by neighbours."""
     return float(np.median(np.abs(values - from_neighbours(values, motions.seconds, motions.moment))))
 
 

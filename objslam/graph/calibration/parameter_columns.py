@@ -1,4 +1,4 @@
-"""The derivatives of the residuals of a graph by the shared errors, by kind of measurement."""
+"""Compute the derivatives of the residuals of a graph by the shared errors, for each kind of measurement."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,28 +16,28 @@ from objslam.graph.factors.localized_rows import LocalizedRows
 from objslam.graph.least_squares.joint_rows import from_origins
 
 _SHORT = 1e-3
-"""The step of a derivative, as a share of `errors.steps`. With a larger share, the derivative contains more of the
-curvature. With a share below 1e-6, it contains rounding errors."""
+"""The step over which a residual is differentiated, as a share of `errors.steps`. With a larger share, the derivative
+contains more of the curvature. With a share below 1e-6, it contains rounding errors."""
 
 
 _Inputs = tuple[Floats | None, ...]
-"""What the measured values of a kind of measurement depend on."""
+"""The arrays on which the measured values of a kind of measurement depend."""
 
 
 def parameter_columns(
     of: Linearised, errors: CalibratedMeasurements, theta: Floats
 ) -> tuple[Floats, dict[int, Bools], RaysAcross]:
-    """Return derivatives (M, P) of the whitened residuals by the parameters, and the poses (K,) and rays that clocks move.
+    """Return derivatives (M, P) of the whitened residuals by the parameters, and the poses and rays that clocks move.
 
-    The robust weights are kept fixed. A derivative by a clock is a central difference, because velocities change abruptly.
-    The measurements are smooth functions of the other parameters. So a difference over a short step (`_SHORT`) is exact
-    enough there.
+    The poses are a mask (K,) for each clock, by the index of its parameter. The robust weights are kept fixed. A derivative
+    by a clock is a central difference, because velocities change abruptly. The measurements are smooth functions of the
+    other parameters, so a difference over a short step (`_SHORT`) is exact enough for them.
 
     Derivatives of rays are taken where the solution expects the rays, not where they were measured. How much an error
-    changes a ray depends on the ray: a lens turns directions in the middle by more than those at the edge, and a scale moves
-    far ranges by more than near ones. At measured rays, the derivatives would contain the noise of the residuals, and their
-    product would bias the errors (errors in variables; Fuller 1987). On 4,000 frames of a simulated rig, the centre of an
-    image came to 4 standard deviations off, and an offset of ranges to 7.
+    changes a ray depends on the ray. A lens turns directions in the middle by more than directions at the edge, and a scale
+    moves far ranges by more than near ones. At measured rays, the derivatives would contain the noise of the residuals. The
+    product of derivatives and residuals would bias the errors (errors in variables; Fuller 1987). On 4,000 frames of a
+    simulated rig, the centre of an image was 4 standard deviations off, and an offset of ranges 7.
     """
     joined = of.measured.multiframes
     errors = _at_expected_rays(of, errors, theta)
@@ -70,7 +70,8 @@ def parameter_columns(
 
 
 def _at_expected_rays(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> CalibratedMeasurements:
-    """Return the measurements of the rays in the graph, with the directions and ranges that the solution expects."""
+    """Return the measurements of the rays in the graph. Directions and ranges are replaced by those that the solution
+    expects."""
     images, rays, _ = errors.at(theta, drift=False)
     rays, joined = rays.take(of.which), of.measured.multiframes
     to_landmark = from_origins(joined.rays(images, rays), of.graph.seen(of.map_T_camera, of.positions[of.landmarks]))
@@ -82,7 +83,8 @@ def _at_expected_rays(of: Linearised, errors: CalibratedMeasurements, theta: Flo
 
 
 def _same(ours: _Inputs, theirs: _Inputs) -> bool:
-    """Return whether inputs of a part are equal. The parameters that do not change an array share it."""
+    """Return whether two inputs of a part are equal. An array that a parameter does not change is the same object in
+    both."""
     pairs = [(one, other) for one, other in zip(ours, theirs, strict=True) if one is not other]
     return all(one is not None and other is not None and np.array_equal(one, other) for one, other in pairs)
 
@@ -91,9 +93,9 @@ def _same(ours: _Inputs, theirs: _Inputs) -> bool:
 class _Part:
     """The rows of one kind of measurement, from the row `first` on.
 
-    inputs: returns what the measured values depend on. Parameters that do not change the inputs have no derivative here, and
-    most parameters change those of one kind of measurement. measured: returns the measured values of these rows. residuals:
-    returns the whitened residuals of measured values.
+    inputs: returns the arrays on which the measured values depend. Parameters that do not change the inputs have the
+    derivative 0. Most parameters change the inputs of only one kind of measurement. measured: returns the measured values of
+    the rows. residuals: returns the whitened residuals (n, ...) of measured values.
     """
 
     first: int
@@ -103,8 +105,8 @@ class _Part:
 
 
 _Turned = Callable[[Keyframes, Ints | slice], Floats]
-"""Returns the poses (n, 4, 4) of the cameras of some keyframes on their mounts, in the frames of the cameras on the present
-mounts."""
+"""A function that returns the poses (n, 4, 4) of the cameras of some keyframes, in the frames of the same cameras on their
+present mounts."""
 
 
 def _parts(of: Linearised, mounts: Floats, ranges: Floats) -> tuple[_Part, ...]:
@@ -121,10 +123,11 @@ def _parts(of: Linearised, mounts: Floats, ranges: Floats) -> tuple[_Part, ...]:
 
 
 def _off(measured: Floats, solved: Floats, turned: Floats) -> Floats:
-    """Return how far solved poses or motions (n, 4, 4) of cameras are from the measured ones, as twists (n, 6) of the base.
+    """Return how far solved poses or motions (n, 4, 4) of cameras are from the measured ones, as twists (n, 6).
 
-    The noise belongs to the base. It turns with the camera, or a residual of the heading would make the tilt of the camera
-    look known: turned by this tilt, it would become a roll of the robot, whose noise is far smaller.
+    The twists are in the frames of the cameras on their present mounts (`turned`: (n, 4, 4)), because the noise belongs to
+    the base. Otherwise, a change of the camera's tilt would turn a residual of the heading into a roll of the robot. The
+    noise of the roll is far smaller, so the tilt would look known.
     """
     return log_se3(turned @ inverse(measured) @ solved @ inverse(turned))
 

@@ -1,4 +1,4 @@
-"""Hypotheses on the errors of localised poses, and the search for the one that agrees best with predicted poses."""
+"""Describe the errors of localised poses by models, and find the model that agrees best with predicted poses."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,42 +11,42 @@ from objslam.core.noise import MOST_NOISE, MOST_POSE_NOISE
 from objslam.core.statistics import WHITE, Lasting
 
 _TIMES = tuple(2.0**k for k in range(8))
-"""The tried times (s) for which errors last. A shorter one hardly differs from new errors in each pose, and a longer one
-from a shift of the whole map. More times are finer and slower."""
+"""The tried times (s) for which errors last. Errors of a shorter time hardly differ from new errors in each pose, and errors
+of a longer time from a shift of the whole map. More times are more exact and slower."""
 _FINE = np.geomspace(_TIMES[0], _TIMES[-1], 200)
-"""The times (s) at which a table is computed. The time that belongs to a mean of several of `_TIMES` is interpolated in this
-table. More times are finer."""
+"""The times (s) of the table in which the time of an averaged error is interpolated. `_TIMES` are too coarse for this. More
+times are more exact."""
 _SHARES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.85, 0.95, 0.99, 1.0)
-"""The tried shares of an error that last. More shares are finer and slower."""
+"""The tried shares of an error's variance that last. More shares are more exact and slower."""
 _STEPS = (0.8, 0.3, 0.1)
-"""The steps of the search for factors on noise, as logarithms. A smaller last step is more exact and slower."""
+"""The steps of the search for factors on noise, in logarithms. A smaller last step is more exact and slower."""
 _BOTH = ("heading", "place")
-"""The errors of a pose."""
+"""The names of the two errors of a pose."""
 _SIZES = (-1.5, 0.0, 1.0, 2.0, 3.0)
-"""The factors on noise at which a search begins, as logarithms. More are slower."""
+"""The logarithms of the factors on noise that are tried as starts of a search. More starts are slower."""
 _AROUND = np.array([-1.2, -0.8, -0.4, -0.2, 0.0, 0.2, 0.4, 0.6, 0.8, 1.2])
-"""The variance of a lasting error is averaged over these factors around the most likely one, as logarithms. They reach far,
-because a short log may agree with two quite different sizes. More of them are more exact and slower."""
+"""The logarithms of the factors, relative to the most likely one, over which the variance of a lasting error is averaged.
+They reach far, because a short log may agree with two quite different sizes. More factors are more exact and slower."""
 _USUAL = 1.0
-"""The standard deviation of the logarithm of a factor on noise above 1, before the log is seen. In a short log, an error of
-usual size looks like one twice as large that lasts four times as long. A larger value makes the second one more likely."""
+"""The prior standard deviation of the logarithm of a factor on noise, for factors above 1. In a short log, an error of usual
+size looks like one twice as large that lasts four times as long. A larger value makes the larger error more likely."""
 _LEAST_FACTOR, _MOST_FACTOR = np.log(0.05), np.log(MOST_POSE_NOISE)
-"""The bounds of the logarithm of a factor on noise. A localisation may be far better than the settings say. Without small
-factors, its small differences from pose to pose would look like errors that last."""
+"""The bounds of the logarithm of a factor on noise. A localisation may be far better than the settings say. If small factors
+were not allowed, its small differences from pose to pose would look like errors that last."""
 _PREDICTED = (np.log(0.3), np.log(MOST_NOISE))
-"""The bounds of the logarithm of the factor on the error of the prediction, whose noise may be unknown too."""
+"""The bounds of the logarithm of the factor on the error of the prediction. This noise may be unknown too."""
 _CHANCE = 1e-3
-"""The chance of a false alarm: that a localisation which is as good as the settings say is found worse. With a larger value,
-shorter logs can show its noise, and more good logs seem to have such noise."""
+"""The chance of a false alarm: a localisation that is as good as the settings say is found worse. With a larger chance,
+shorter logs can show more noise, and more good logs seem to have more noise."""
 _SIGNIFICANT = -2 * np.log(_CHANCE)
-"""Noise beyond the settings, or a lasting part, counts if it lowers -2 ln of the likelihood by at least this value: the
-quantile of chi-squared, with 2 degrees of freedom, that is exceeded with the probability `_CHANCE`."""
+"""The decrease of -2 ln of the likelihood from which on noise beyond the settings, or a lasting part, counts. Chi-squared
+with 2 degrees of freedom exceeds this value with the probability `_CHANCE`."""
 
 
 @dataclass(frozen=True)
 class ErrorKind:
-    """The error of headings, or of places. factor: the logarithm of the factor on its noise. share, time: the places of its
-    lasting part in `_SHARES` and `_TIMES`."""
+    """The error of headings, or of places. factor: the logarithm of the factor on its noise. share, time: the indices of the
+    share in `_SHARES` and of the time in `_TIMES` that describe its lasting part."""
 
     factor: float = 0.0
     share: int = 0
@@ -54,13 +54,13 @@ class ErrorKind:
 
     @property
     def lasting(self) -> Lasting:
-        """The lasting part."""
+        """The lasting part of the error."""
         return Lasting(_SHARES[self.share], _TIMES[self.time]) if self.share else WHITE
 
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """A hypothesis: the errors of headings and places, and the logarithm of the factor on the error of the prediction."""
+    """A model of the errors of a pose. predicted: the logarithm of the factor on the error of the prediction."""
 
     heading: ErrorKind = ErrorKind()
     place: ErrorKind = ErrorKind()
@@ -69,13 +69,13 @@ class PoseErrors:
 
 @dataclass(frozen=True)
 class ComparedPoses:
-    """n poses of the localisation against their prediction.
+    """n poses of the localisation and their prediction.
 
-    off: (3 n,) headings (rad), x and y (m), prediction minus localisation. covariance: (3 n, 3 n) of the prediction by its
-    noise. shared: (3 n, 3 n) of the prediction by the shared errors, and of the localisation by the odometry that carried it
-    to the poses. It does not grow with the noise. times: (n,) s. apart: s, the time between two poses that were measured
-    independently, 0 if all poses were. nominal: of headings, rad, and places, m. free: whether the size of the noise is
-    unknown. prior: the weight of the noise of the prediction, as a number of residuals.
+    off: (3 n,) headings (rad), x and y (m), prediction minus localisation. covariance: (3 n, 3 n) of `off` by the noise of
+    the prediction. shared: (3 n, 3 n) of `off` by the shared errors, and by the odometry that carried the localisation to
+    the poses. No factor multiplies it. times: (n,) s. apart: s, the time between poses that were measured independently, 0
+    if all were. nominal: the noise of headings, rad, and places, m, in the settings. free: whether the size of the noise is
+    unknown. prior: the weight of the nominal noise of the prediction, as a number of residuals.
     """
 
     off: Floats
@@ -103,16 +103,16 @@ class ComparedPoses:
 
     @cached_property
     def white(self) -> Floats:
-        """(n, n) the correlation of errors that are new in each measured pose."""
+        """(n, n) the correlations of errors that are new in each measured pose."""
         return np.maximum(1 - self.gaps / self.apart, 0.0) if self.apart else np.eye(len(self.times))
 
     @cached_property
     def alike(self) -> Floats:
-        """(m, n, n) the correlations of errors that last for each of `_TIMES`."""
+        """(m, n, n) the correlations of errors that last for a time, for each of the m `_TIMES`."""
         return np.exp(-self.gaps / np.array(_TIMES)[:, None, None])
 
     def expected(self, model: PoseErrors) -> Floats:
-        """Return the covariance (3 n, 3 n) of `off`."""
+        """Return the covariance (3 n, 3 n) of `off` in a model."""
         n, found = len(self.times), self.by_prediction(model.predicted).copy()
         for first, kind, nominal in ((0, model.heading, self.nominal[0]), (1, model.place, self.nominal[1])):
             own = self._own(kind, nominal)
@@ -127,7 +127,7 @@ class ComparedPoses:
         return own + variance * lasting.share * self.alike[kind.time] if lasting.share else own
 
     def by_prediction(self, predicted: float) -> Floats:
-        """Return the covariance (3 n, 3 n) of `off` without the poses' own error. The last is kept: few steps change it."""
+        """Return the covariance (3 n, 3 n) of `off` without the localisation's own error. The last result is kept."""
         if predicted not in self._predicted:
             self._predicted.clear()
             self._predicted[predicted] = np.exp(2 * predicted) * self.covariance + self.shared
@@ -148,8 +148,8 @@ class ComparedPoses:
     def cost(self, model: PoseErrors) -> float:
         """Return -2 ln of the likelihood, with the priors of the factors on the noise.
 
-        Values are kept, because the searches come back to the same models. This takes a quarter less time. The values of
-        places alone (`_Placed`) are kept too, because a third of the models differ in headings only. This takes another
+        Costs are kept, because the searches come back to the same models. This takes a quarter less time. The parts of the
+        places alone (`_Placed`) are also kept, because a third of the models differ in headings only. This takes a further
         third less.
         """
         if model not in self._costs:
@@ -187,9 +187,9 @@ class _Placed:
 
     @classmethod
     def of(cls, covariance: Floats, own: Floats, off: Floats) -> "_Placed | None":
-        """Take the places out of a covariance (3 n, 3 n) of `off` (3 n,), headings first. None if it is singular.
+        """Return the likelihood. None if the covariance (3 n, 3 n) of `off` (3 n,), headings first, is singular.
 
-        own: (n, n) the covariance of each axis of the places that is not yet in `covariance`.
+        own: (n, n) the localisation's own covariance for each axis of the places, which is not yet in `covariance`.
         """
         n = len(off) // 3
         places = covariance[n:, n:].copy()
@@ -206,15 +206,15 @@ class _Placed:
 
 
 def most_likely(data: ComparedPoses, near: PoseErrors | None = None) -> PoseErrors:
-    """Return the simplest model that the data do not refute. The models, from the simplest on, are: the noise in the
-    settings, more noise, one lasting share for headings and places, and a lasting share for each of the two.
+    """Return the simplest model that the data do not refute. From the simplest on, the models have the noise in the
+    settings, more noise, one lasting part for headings and places, and a lasting part for each of the two.
 
-    If places err for seconds, headings probably do too, because both come from one filter. A short log may not show it.
-    near: the model of nearly the same data, if it is known. It saves most of the search for errors that last.
+    If places err for seconds, headings probably do too, because both come from one filter. A short log may not show this.
+    near: the model of nearly the same data, if known. It saves most of the search for errors that last.
     """
     most = _MOST_FACTOR if data.free else 0.0
     usual, cost_usual = _searched(data, _begun(data, PoseErrors(), 0.0), 0.0, ())
-    # A search may end at too large a prediction error. So another search begins at the error by the odometry's noise.
+    # A search may end at too large a prediction error. So another search begins at the factor 1 on this error.
     begun = {_begun(data, replace(usual, predicted=predicted), most) for predicted in (0.0, usual.predicted)}
     best, least = min((_searched(data, start, most, ()) for start in begun), key=lambda found: found[1])
     if near is not None and near.heading.share and near.place.share:
@@ -230,10 +230,11 @@ def most_likely(data: ComparedPoses, near: PoseErrors | None = None) -> PoseErro
 
 
 def averaged(data: ComparedPoses, model: PoseErrors) -> tuple[tuple[float, Lasting], tuple[float, Lasting]]:
-    """Return the noise and the lasting parts of headings and places, averaged over their posterior if they last.
+    """Return the factor on the noise and the lasting part of headings and of places. Errors that last are averaged.
 
     A log contains few independent samples of an error that lasts. The most likely values would make the noise too small. So
-    two variances are averaged: of the error, and of its mean over the log. The time is the one that gives this mean.
+    the variance of the error, and the variance of its mean over the log, are averaged over the posterior. The time is the
+    one with the averaged variance of the mean.
     """
     duration = float(np.ptp(data.times))
     found = dict[str, tuple[float, Lasting]]()
@@ -253,7 +254,7 @@ def averaged(data: ComparedPoses, model: PoseErrors) -> tuple[tuple[float, Lasti
         of_mean = float((variance * _variance_of_mean(np.array(_TIMES), duration)).sum() / variance.sum())
         seconds = float(np.interp(of_mean, _variance_of_mean(_FINE, duration), _FINE))
         total = float(variance.sum())
-        # Poses count as no better than the settings say. If they are, the rest of this noise is white.
+        # Poses count as no better than the settings say. If they are better, the rest of the nominal noise is white.
         found[name] = max(float(np.sqrt(total)), 1.0), Lasting(_SHARES[kind.share] * min(total, 1.0), seconds)
     return found["heading"], found["place"]
 
@@ -277,19 +278,19 @@ def _with_lasting(model: PoseErrors, names: tuple[str, ...], share: int, time: i
 
 
 def _begun(data: ComparedPoses, model: PoseErrors, most: float) -> PoseErrors:
-    """Return the best of a few models. Their errors have sizes up to `most`, and their prediction has the error of
-    `model`."""
+    """Return the best of a few models without lasting errors. The logarithms of their factors are at most `most`, and their
+    prediction has the error of `model`."""
     sizes = [size for size in _SIZES if size <= most]
     tried = [replace(model, heading=ErrorKind(heading), place=ErrorKind(place)) for heading in sizes for place in sizes]
     return min(tried, key=data.cost)
 
 
 def _lasting(data: ComparedPoses, most: float) -> tuple[PoseErrors, float]:
-    """Return the model of the least cost in which both errors last, and this cost.
+    """Return the model with the least cost in which both errors last, and this cost.
 
-    Searches begin at four times, at the sizes that the settings say. White errors that fit a lasting one are far too small,
-    because the prediction, which drifts, takes up most of it. A search that begins there ends there. All searches take long
-    steps, and the best two go on with short ones.
+    The searches begin at four times, with the noise in the settings. They do not begin at the best white errors. Those are
+    far too small, because the drifting prediction takes up most of a lasting error, and a search from there ends there. All
+    searches take long steps, and the best two go on with short ones.
     """
     begun = [_with_lasting(PoseErrors(), _BOTH, len(_SHARES) - 1, time) for time in (1, 3, 5, 7)]
     rough = sorted((_searched(data, start, most, (_BOTH,), _STEPS[:1]) for start in begun), key=lambda found: found[1])
@@ -303,10 +304,10 @@ def _searched(
     lasting: tuple[tuple[str, ...], ...],
     steps: tuple[float, ...] = _STEPS,
 ) -> tuple[PoseErrors, float]:
-    """Return the model of the least cost, and this cost, by steps along the axes, then smaller ones.
+    """Return the model with the least cost, and this cost. The search takes steps along the axes, from large to small.
 
-    most: the largest logarithm of a factor on noise. lasting: groups of errors whose lasting part changes. A group has one
-    part. steps: the steps of factors, as logarithms.
+    most: the largest logarithm of a factor on noise. lasting: groups of errors whose lasting part changes. The errors of a
+    group share one lasting part. steps: the steps of factors, in logarithms.
     """
     best, cost = start, data.cost(start)
     for step in steps:

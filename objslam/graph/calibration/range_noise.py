@@ -1,7 +1,7 @@
-"""Estimate the noise of ranges from their residuals: of all labels, and of each label.
+"""Estimate the noise of ranges from their residuals, for all labels together and for each label.
 
-Ranges of a thing that a camera sees through, such as a table, end behind it. So the ranges of some labels are worse than
-those of others.
+Some ranges of a thing that a camera can see past, such as a table, end behind the thing. So the ranges of some labels are
+worse than those of others.
 """
 
 import math
@@ -13,22 +13,26 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import HUBER_K, NORMAL_MEDIAN, grouped_median
 
 _PRIOR_OBJECTS = 4
-"""The range bias in the settings weighs at most as much as this number of objects. With a larger number, the bias changes
+"""The largest weight of the range bias in the settings, as a number of objects. With a larger number, the bias changes
 less."""
 _LABEL_OBJECTS = 2
-"""The bias of all labels weighs as much as this number of objects in the bias of one label. With a larger number, labels
-differ less."""
+"""The weight of the bias of all labels in the bias of one label, as a number of objects. With a larger number, labels differ
+less."""
 _BEYOND = math.erfc(HUBER_K / math.sqrt(2))
-"""The share of Gaussian numbers beyond `HUBER_K` sigmas. `scipy.stats` has it too, but its import takes half a second."""
+"""The share of Gaussian numbers beyond `HUBER_K` standard deviations. `scipy.stats` has the function for this, but its
+import takes half a second."""
 _HUBER_SHARE = 1 - _BEYOND - 2 * HUBER_K * math.exp(-(HUBER_K**2) / 2) / math.sqrt(2 * math.pi) + HUBER_K**2 * _BEYOND
-"""The mean of min(z^2, `HUBER_K`^2) for Gaussian z."""
-_ROUNDS = 30  # The most rounds of Huber's proposal 2. It converges in a few. A larger number takes longer.
+"""The mean of min(z^2, `HUBER_K`^2) for Gaussian numbers z with the standard deviation 1."""
+_ROUNDS = 30  # The most rounds of Huber's proposal 2. It converges in a few rounds. A larger number takes longer.
 
 
 @dataclass(frozen=True)
 class RangeNoise:
-    """The nominal noise of q ranges. owner: (q,) the landmark of each range. label: (q,) of its box. landmark_label: (N,).
-    sigma: (q,) m, of a single range. bias: (q,) m, of the error that the ranges of an object share."""
+    """The nominal noise of q ranges to N landmarks.
+
+    owner: (q,) the landmark of each range. label: (q,) the label of the box of each range. landmark_label: (N,). sigma: (q,)
+    m, the standard deviation of a single range. bias: (q,) m, that of the error that the ranges of an object share.
+    """
 
     owner: Ints
     label: Ints
@@ -37,9 +41,9 @@ class RangeNoise:
     bias: Floats
 
     def total(self, factors: Floats) -> Floats:
-        """Return the noise (q,), m, of ranges, with their share of the object's bias, as in `factors.range.share_bias`.
+        """Return the noise (q,), m, of ranges, with their part of the object's bias, as in `factors.range.share_bias`.
 
-        factors: (2, L) of each label.
+        factors: (2, L) the factors on `sigma` and on `bias` for each label.
         """
         ranges, bias = factors[:, self.label]
         number = np.bincount(self.owner)[self.owner] if len(self.owner) else np.zeros(0)
@@ -49,8 +53,8 @@ class RangeNoise:
         """Return the factors on the noise of single ranges and on their bias, and both factors (2, L) for each label.
 
         The factors of a label are NaN if it has fewer than two objects with a bias. One object tells nothing about its
-        label: its rays may be those of two things, or its place may be wrong. off: (q,) m, the residuals. labels: the number
-        of labels. prior: the weight of the nominal noise, as a number of residuals.
+        label, because its rays may be those of two things, or its place may be wrong. off: (q,) m, the residuals. labels:
+        the number L of labels. prior: the weight of the nominal noise, as a number of residuals.
         """
         count, label = len(self.landmark_label), self.landmark_label
         number = np.bincount(self.owner, minlength=count)
@@ -70,7 +74,7 @@ class RangeNoise:
         own = np.where(many > 1, own, ranges)
         typical = np.sqrt(grouped_median(self.sigma**2, self.owner, count)[has]) * own[label[has]]
         squares = (middle[has] ** 2 - typical**2 / number[has]) / bias[has] ** 2
-        # Where no label has two objects, nothing tells bad labels from bad places, and both are noise.
+        # If no label has two objects, nothing tells bad labels from bad places. Then both count as noise.
         limit = HUBER_K**2 if many.max() > 1 else np.inf
         shared = _robust_variance(squares, min(prior, float(_PRIOR_OBJECTS)), limit)
         total = np.maximum(np.bincount(label[has], squares, labels), 0.0)
@@ -79,9 +83,10 @@ class RangeNoise:
 
 
 def _robust_variance(squares: Floats, weight: float, limit: float) -> float:
-    """Return the variance with Huber's proposal 2 (Huber 1964) from squares (n,), and 1 with this weight.
+    """Return the variance from squares (n,) by Huber's proposal 2 (Huber 1964), with a prior variance of 1.
 
-    limit: a square counts up to this number of variances. With inf, the result is the mean.
+    weight: the weight of the prior, as a number of squares. limit: the number of variances up to which a square counts. With
+    inf, the result is the weighted mean.
     """
     variance, share = 1.0, _HUBER_SHARE if np.isfinite(limit) else 1.0
     for _ in range(_ROUNDS):

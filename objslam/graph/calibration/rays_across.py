@@ -1,4 +1,4 @@
-"""The rays of a multiframe whose camera is not the first: how their residuals change if base moves between two images."""
+"""Compute how the residuals of rays change if base moves between two images of a multiframe."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +13,8 @@ from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.least_squares.joint_rows import from_origins
 
 _STEP = 1e-6
-"""The twist (rad, m) over which residuals are differentiated. A longer one adds the curvature, a shorter one rounding."""
+"""The step (rad and m) of the twist over which residuals are differentiated. A longer step adds more of the curvature, and a
+shorter step adds rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -23,10 +24,10 @@ class RaysAcross:
     The first image gives the pose of the multiframe. If the clock of another image is later, base has moved on in between.
     If the clock of the first image is later, base has moved back.
 
-    pose: (n,) the multiframe. sign: for each clock, by the index of its parameter, (n,) how the clock moves the ray's image
-    after the first one: 1, -1, or 0 for the clock of neither. rows: (n, 3) the rows of the linear system of each ray: two
-    of its bearing and one of its range, -1 without a range. to_rows: (n, 3, 6) from velocities of base, with the rotation
-    first, to these rows.
+    pose: (n,) the multiframe of each ray. sign: for each clock, by the index of its parameter, (n,) 1 if it is the clock of
+    the ray's image, -1 if it is the clock of the first image, and 0 for neither. rows: (n, 3) the rows of each ray in the
+    linear system, two of its bearing and one of its range, -1 without a range. to_rows: (n, 3, 6) from velocities of base,
+    with the rotation first, to the rows.
     """
 
     pose: Ints
@@ -38,8 +39,8 @@ class RaysAcross:
     def of(cls, of: Linearised, images: Keyframes, rays: Rays, clocks: Mapping[int, int]) -> Self:
         """Return the rays of a graph.
 
-        images: the corrected images. rays: (R,) the corrected rays of the images that are in the graph, with the directions
-        that the solution expects. clocks: the camera of each clock, by the index of its parameter.
+        images: the corrected images. rays: the corrected rays in the graph, with the directions that the solution expects.
+        clocks: the camera of each clock, by the index of its parameter.
         """
         joined, graph, image = of.measured.multiframes, of.graph, rays.keyframe
         first = joined.first[joined.number[image]]
@@ -84,7 +85,10 @@ class RaysAcross:
         columns[self.rows[mine][there]] = values[there]
 
     def pull(self, residual: Floats, clock: int, count: int) -> Floats:
-        """Return the velocities' factors (count, 6) in the product of residuals (M,) with the columns that `put` writes."""
+        """Return the factors (count, 6) of velocities in the product of residuals (M,) with the columns that `put` writes.
+
+        count: the number of poses.
+        """
         pulls = np.zeros((count, 6))
         mine = np.flatnonzero(self.sign[clock])
         rows = self.rows[mine]

@@ -1,4 +1,4 @@
-"""Estimate the errors that all measurements share, around the joint solve: variable projection (Golub and Pereyra 1973).
+"""Estimate the errors that all measurements share, around the joint solve, by variable projection (Golub and Pereyra 1973).
 
 An outer Gauss-Newton step moves the parameters. An inner solve then fits poses and landmarks to the new measurements.
 """
@@ -33,27 +33,27 @@ _ROUNDS = 8
 """The most outer steps of a search. The MRCLAM robots, whose clocks are 0.2 s off, take 1 or 2 steps before the noise is
 known, and 1 or 2 after. A larger number is slower."""
 _CONVERGED = 0.2
-"""A parameter has converged if its step is below this many posterior standard deviations. A larger number ends sooner."""
+"""The step of a parameter, in posterior standard deviations, below which it has converged. A larger step ends sooner."""
 _NEARLY = 2.0
-"""The limit of `_CONVERGED` before the noise is known. The search goes on with the new noise, so its first part may end near
-the optimum. A larger number ends it sooner, but then the residuals from which the noise is estimated contain more of the
-shared errors."""
+"""The limit that replaces `_CONVERGED` before the noise is known. The search goes on with the new noise, so its first part
+may end near the optimum. A larger limit ends this part sooner, but the residuals that give the noise then contain more of
+the shared errors."""
 _HALVINGS = 3
-"""The most times that a step is halved if it does not lower the cost. A larger number tries shorter steps. If no step lowers
+"""The most times that a step that does not lower the cost is halved. A larger number tries shorter steps. If no step lowers
 the cost, the parameters stay as they are."""
 _KEPT = 0.8
-"""A step is halved, or a new noise is refused, if less than this share of the rays that agreed before still agrees after it.
-The rays of things that move fit no place. With them, a solve can move far from the others, and lose one ray after another.
-Right steps of recorded robots kept 0.99, and wrong ones of a robot among others 0.77 and less. A smaller share refuses fewer
-steps."""
+"""The least ratio of the number of agreeing rays after a step, or with a new noise, to the number before. Below this ratio,
+the step is halved, or the noise is refused. The rays of moving things fit no place. They can move a solve far from the other
+rays, so that it loses one ray after another. Right steps of recorded robots kept 0.99, and wrong steps of a robot among
+others kept 0.77 and less. A smaller ratio refuses fewer steps."""
 _NOISE_ROUNDS = 3
 """The most estimations of the noise, each followed by a solve with it. Later rounds are slower and change the noise less."""
 _SAME_NOISE = 0.1
-"""The relative change of the noise below which it is not estimated again. A larger value ends sooner."""
+"""The relative change of the noise below which the noise is not estimated again. A larger change ends sooner."""
 
 _SAME_SHARES = 0.5
-"""The shares of noise in the information are computed again if the noise changes by more than this share. They change slowly
-with the noise. A larger value computes them less often."""
+"""The relative change of the noise above which the shares of noise in the information (`noise_shares`) are computed again.
+These shares change slowly with the noise. With a larger change, they are computed less often."""
 
 Measure = Callable[[Keyframes, Rays, Settings], Measurements]
 """A function that collects the measurements of keyframes and rays with the noise of the settings."""
@@ -63,8 +63,9 @@ Measure = Callable[[Keyframes, Rays, Settings], Measurements]
 class CalibratedSolution:
     """A joint solution at the shared errors and the noise that fit best.
 
-    errors: the measurements with this noise. sensitivity: (N, 3, P) of the landmarks, m per unit of each parameter, NaN for
-    a landmark outside the graph.
+    errors: the measurements with this noise. measured: the measurements at the shared errors. found: the joint solution.
+    sensitivity: (N, 3, P) the derivatives of the landmarks, m per unit of each parameter, NaN for a landmark outside the
+    graph.
     """
 
     calibration: Calibration
@@ -82,7 +83,7 @@ def calibrate(
     theta: Floats,
     trace: Trace | None = None,
 ) -> CalibratedSolution:
-    """Estimate the shared errors and the noise from a joint solution at `theta` (P,).
+    """Estimate the shared errors and the noise. The search starts at the joint solution `found` at theta (P,).
 
     The inliers are tested again after each step. A parameter that the log does not determine stays at its prior.
 
@@ -92,7 +93,7 @@ def calibrate(
     fit = _Fit(errors, measure, trace)
     state = InnerSolve(measure(*errors.at(theta)), association, found.map_T_camera, found.positions, found.used)
     state = state.ordered(found.near)
-    nearly = bool(errors.unknown_noise) and len(theta) > 0 and errors.noise == NOMINAL  # Else, it is known from before.
+    nearly = bool(errors.unknown_noise) and len(theta) > 0 and errors.noise == NOMINAL  # Else, the noise is known.
     at = fit.shared_errors(state, theta, _NEARLY if nearly else _CONVERGED)
     state, theta, steps = at.state, at.theta, at.steps
     for _ in range(_NOISE_ROUNDS if errors.unknown_noise else 0):
@@ -111,7 +112,7 @@ def calibrate(
             break
     if len(theta):
         fit = replace(fit, wider=correlation_factors(at.state, at.system))
-        first = at.system if state is at.state else None  # The widening leaves the linear system as it is.
+        first = at.system if state is at.state else None  # Wider deviations do not change the linear system.
         at = fit.shared_errors(state, theta, _CONVERGED, at.noise, first)
         state, theta, steps = at.state, at.theta, steps + at.steps
     nothing = np.zeros(len(state.used), dtype=bool)
@@ -142,9 +143,10 @@ def calibrate(
 def misfit_at_shared_errors(
     errors: CalibratedMeasurements, measure: Measure, association: Association, found: JointSolution, theta: Floats
 ) -> float:
-    """Return the misfit of a joint solution at the shared errors that fit it best, with their squared deviations.
+    """Return the misfit of a joint solution at the shared errors that fit it best.
 
-    It compares solutions at the noise of `errors`. The search begins at theta (P,). SolveError as in `calibrate`.
+    The squared deviations of the shared errors from their priors are added. The misfit compares solutions at the noise of
+    `errors`. The search starts at theta (P,). SolveError as in `calibrate`.
     """
     state = InnerSolve(measure(*errors.at(theta)), association, found.map_T_camera, found.positions, found.used)
     at = _Fit(errors, measure, None).shared_errors(state.ordered(found.near), theta, _NEARLY)
@@ -154,10 +156,11 @@ def misfit_at_shared_errors(
 
 
 def _noise_of_measurements(fit: _Fit, state: InnerSolve, system: LinearSystem, theta: Floats) -> NoiseFactors:
-    """Return the noise of all kinds of measurements. system: of the state, at the shared errors theta (P,).
+    """Return the noise of all kinds of measurements. system: the linear system of the state at shared errors theta (P,).
 
-    If the noise of the localisation is unknown too, a graph without it shows that of the others. In a graph with it, poses
-    that err for seconds would look like noise of the rays, and rays that seem noisy would hide how much the poses err.
+    If the noise of the localisation is unknown too, a graph without the localisation gives the noise of the other kinds. In
+    a graph with the localisation, poses that err for seconds would look like noise of the rays, and rays that seem noisy
+    would hide how much the poses err.
     """
     errors, prior = fit.errors, fit.prior_residuals
     if "localization" not in errors.unknown_noise:
@@ -174,8 +177,8 @@ def _noise_of_measurements(fit: _Fit, state: InnerSolve, system: LinearSystem, t
 class _Found:
     """The parameters theta (P,) that fit best, and the solution at them.
 
-    system: the linear system at the solution. reduced: the system with poses and landmarks eliminated. noise: (P,) from
-    `noise_shares`. steps: the number of outer steps.
+    system: the linear system at the solution. reduced: the system with poses and landmarks eliminated, None without
+    parameters. noise: (P, P) from `noise_shares`. steps: the number of outer steps.
     """
 
     theta: Floats
@@ -188,10 +191,11 @@ class _Found:
 
 @dataclass(frozen=True)
 class _Outer:
-    """The state of the search for the parameters theta (P,) of shared errors and noise.
+    """The state of the search for the shared errors theta (P,).
 
-    gradient: (P,) and information: (P, P) of the likelihood. curvature: (P, P) the information with the prior. step: (P,) of
-    Gauss-Newton.
+    linear: the linear system. system: the same with poses and landmarks eliminated. gradient: (P,) minus the gradient of the
+    negative log-likelihood. information: (P, P) of the likelihood. curvature: (P, P) the information plus that of the prior.
+    step: (P,) the Gauss-Newton step.
     """
 
     state: InnerSolve
@@ -214,11 +218,11 @@ class _Outer:
         return float(self.step @ self.curvature @ self.step) / 2
 
     def converged(self, step: Floats, share: float) -> bool:
-        """Return whether a step (P,) is below this share of the standard deviations."""
+        """Return whether each step (P,) is below this share of the standard deviation of its parameter."""
         return bool((np.abs(step) < share * self.deviations).all())
 
     def cost_of_signal(self, cost: float, other: Floats) -> float:
-        """Return the cost at other parameters (P,), corrected for the noise of the odometry, which biases the cost."""
+        """Return a cost at other parameters (P,), without the bias by the noise of the odometry."""
         moved = other - self.theta
         bent = self.system.information - self.information
         return float(cost - (self.gradient - self.system.descent) @ moved - moved @ bent @ moved / 2)
@@ -229,7 +233,7 @@ class _Fit:
     """The input of a search for shared errors: the measurements as a function of the errors.
 
     wider: (P,) factors on the standard deviations of the gradient, for noise that is not white, None until they are known.
-    They can be known only where the parameters fit, because wrong parameters cause correlated residuals too.
+    They are computed only at parameters that fit, because wrong parameters also cause correlated residuals.
     """
 
     errors: CalibratedMeasurements
@@ -252,7 +256,7 @@ class _Fit:
     ) -> _Found:
         """Return the parameters that fit best. The search starts at theta (P,).
 
-        converged: the number of posterior standard deviations below which a step ends the search. noise: (P,) from
+        converged: the number of posterior standard deviations below which a step ends the search. noise: (P, P) from
         `noise_shares`, if known. first: the linear system at the start, if known.
         """
         errors = self.errors

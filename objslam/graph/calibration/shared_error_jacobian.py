@@ -1,6 +1,7 @@
-"""The linear system of a graph whose parameters are the shared errors. It shows how the joint solution depends on them.
+"""Build the linear system of a graph and its shared errors. It shows how the joint solution depends on the shared errors.
 
-The shared errors are no variables of the graph. Their columns of the Jacobian are differences of the whitened residuals.
+The shared errors are parameters, and not variables of the graph. Their columns of the Jacobian are finite differences of the
+whitened residuals.
 """
 
 from dataclasses import dataclass, replace
@@ -24,15 +25,15 @@ class LinearSystem:
     """The whitened Jacobian and residuals of a graph and its shared errors. The robust weights are kept fixed.
 
     The rows are in the order of `Measurements.factors`: bearings, ranges, landmark priors, motions, absolute poses. The
-    corners of fiducials are last. jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns
-    each. normal: the normal equations of the Jacobian. chain: as in `JointRows`. sides: (M, P) the derivatives of the rows
-    by the shared errors. residual: (M,). first_range, first_motion: the first rows of the ranges and of the motions.
-    instruments: (M, P). At the optimum, the residuals do not correlate with the instruments. The instruments equal the
-    sides, except for clocks and the scales of the odometry: these sides contain the noise of the odometry, and so do the
-    residuals. motions: None if neither the odometry nor a clock is a parameter. clocks: None without a clock. by_path: (M,
-    C) instruments of the C clocks by the solved path. noise: (P, P) from `noise_shares`, the shares of noise in the
-    information. longer: (P,) the ratio of the odometry's noise in the residuals to that in the side of a scale, 0 for other
-    parameters.
+    corners of fiducials are last. jacobian: (M, D) the derivatives of the rows by the variables: first three columns for
+    each landmark, and after them six columns for each pose. sides: (M, P) the derivatives of the rows by the shared errors.
+    instruments: (M, P) columns that replace the sides. At the optimum, the residuals do not correlate with the instruments.
+    An instrument equals its side, except for clocks and for errors of the odometry, because the noise of the odometry is
+    also in the residuals. residual: (M,). first_range, first_motion: the first rows of the ranges and of the motions.
+    normal: the normal equations of the Jacobian. chain: as in `JointRows`. motions: None if neither the odometry nor a clock
+    has a parameter. clocks: None without a clock. by_path: (M, C) the instruments of the C clocks by the solved path. noise:
+    (P, P) from `noise_shares`, the shares of noise in the information. longer: (P,) the ratio of the odometry's noise in the
+    residuals to the noise in the side of a scale, 0 for other parameters.
     """
 
     jacobian: sparse.csr_matrix
@@ -50,7 +51,7 @@ class LinearSystem:
     longer: Floats
 
     def with_noise(self, noise: Floats) -> Self:
-        """Return the system for these shares (P, P) of noise in its sides. They change the instruments of clocks."""
+        """Return the system for shares `noise` (P, P) of noise in its sides. The shares change the instruments of clocks."""
         instruments, columns = self.instruments.copy(), [] if self.clocks is None else list(self.clocks.moved)
         sides = self.sides[:, columns]
         instruments[:, columns] = sides + (self.by_path - sides) @ noise[np.ix_(columns, columns)]
@@ -61,7 +62,8 @@ class LinearSystem:
         return columns - self.jacobian @ self.normal.solve(self.jacobian.T @ columns)
 
     def reduce(self) -> "ReducedSystem":
-        """Eliminate poses and landmarks by a Schur complement, and remove the expected products of noise."""
+        """Return the system with poses and landmarks eliminated (Schur complement), without the expected products of
+        noise."""
         own = np.flatnonzero((self.instruments != self.sides).any(axis=0))
         columns = np.column_stack([self.sides, self.residual, self.instruments[:, own]])
         changes = -self.normal.solve(self.jacobian.T @ columns)
@@ -78,7 +80,7 @@ class LinearSystem:
             shares = self.noise[block]
             poses = len(self.clocks.seconds)
             velocity = self.clocks.changes(changes[-6 * poses :, :count].reshape(poses, 6, count))
-            # The side of a clock can be mostly noise. In products with other instruments, its instrument replaces it.
+            # The side of a clock can be mostly noise. So the clock's instrument replaces it in products with others.
             slope[others[:, None], moved] = variance[others[:, None], moved]
             # The path, and with it the instrument, depends on the parameters too. Without this part, the noise that the path
             # and the side have in common would be in the slope.
@@ -101,9 +103,10 @@ class ReducedSystem:
 
     information: (P, P) the curvature of the cost. descent: (P,) the negative gradient of the cost. gradient: (P,) minus the
     products of the instruments and the residuals, zero at the optimum. slope: (P, P) the decrease of the gradient by each
-    parameter. variance: (P, P) of the gradient by white noise. The gradient and the slope have no expected noise.
-    sensitivity: (D, P) the derivatives of all variables at their optimum by the parameters: first the landmarks, three rows
-    each, then the poses, six rows each. newton: (D,) the remaining Newton step of the variables.
+    parameter. The expected products of noise are removed from the gradient and from the slope. variance: (P, P) the variance
+    of the gradient by white noise. sensitivity: (D, P) the derivatives of all variables at their optimum by the parameters.
+    It has three rows for each landmark, and after them six rows for each pose. newton: (D,) the remaining Newton step of the
+    variables.
     """
 
     information: Floats
@@ -128,7 +131,7 @@ class ReducedSystem:
         )
 
     def with_wider(self, factors: Floats | None) -> Self:
-        """Return the system with larger standard deviations of its gradient. factors: (P,), None leaves them as they are."""
+        """Return the system with the standard deviations of its gradient multiplied by `factors` (P,). None means 1."""
         return self if factors is None else replace(self, variance=self.variance * np.outer(factors, factors))
 
 

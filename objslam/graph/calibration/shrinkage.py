@@ -1,4 +1,4 @@
-"""How much a joint solution shrinks, because noise in the rays makes the path jitter (Neyman and Scott 1948)."""
+"""Compute how much a joint solution shrinks because noise in the rays makes the path jitter (Neyman and Scott 1948)."""
 
 import numpy as np
 
@@ -9,23 +9,23 @@ from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.factors.localized_rows import LocalizedRows
 
 _LEAST_TOLD = 0.3
-"""`shrinking_force` predicts motions by their neighbours if the prediction explains at least this share of the squared
-motions. A larger share uses it more rarely."""
+"""The share of the squared motions above which their prediction by neighbours is used in `shrinking_force`. With a larger
+share, the prediction is used more rarely."""
 
 _HEIGHT = 5
-"""The place of the motion upwards in a twist of the robot's base, whose rotation is first."""
+"""The index of the upward motion in a twist of the robot's base. The rotation comes first in a twist."""
 
 
 def shrinking_force(of: Linearised) -> tuple[float, float]:
-    """Return the force that makes a joint solution too small, and the curvature of the cost. Both are derivatives by the
-    logarithm of the size.
+    """Return the force that makes a joint solution too small, and the curvature of the cost.
 
-    Noise in the rays makes the path jitter. This makes its steps longer than the steps of the odometry. A smaller map makes
-    the steps shorter again at the least cost (errors in variables; Neyman and Scott 1948). The motion residuals pull on the
-    size. Part of the pull is real, and part comes from the noise of the measured motions. Motions that are predicted from
-    their neighbours do not have this noise, and show the real part. The force is the total pull minus the real part, at
-    least 0. If the prediction is poor (`_LEAST_TOLD`), the total pull counts. Without odometry, or with a localisation,
-    there is no force. The curvature is the information of all measured lengths about the size.
+    Both are derivatives of the cost by the logarithm of the map's size. Noise in the rays makes the path jitter, so its
+    steps are longer than the steps of the odometry. A smaller map makes the steps shorter again at the least cost (errors in
+    variables; Neyman and Scott 1948). The motion residuals pull on the size. Part of the pull is real, and part comes from
+    the noise of the measured motions. Motions that are predicted from their neighbours do not have this noise, and show the
+    real part. The force is the total pull minus the real part, at least 0. If the prediction is poor (`_LEAST_TOLD`), the
+    force is the total pull. Without odometry, or with a localisation, the force is 0. The curvature is the information of
+    all measured lengths about the size.
     """
     keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
     before, after = of.graph.moves
@@ -54,11 +54,12 @@ def shrinking_force(of: Linearised) -> tuple[float, float]:
 
 
 def force_of_heights(of: Linearised) -> float:
-    """Return the force with which heights make a solution at localised, planar poses too small, as `shrinking_force`.
+    """Return the force with which heights make a solution at localised, planar poses too small.
 
-    Noise in the rays, and ground that is not flat, lift and lower the solved poses. Planar poses have no heights. They say
-    only how large heights may be, and the log itself shows this. In a smaller map all heights are smaller, and cost less.
-    This says nothing about the size. The motions by odometry are left out, because their noise follows the odometry's scale.
+    The force is a derivative of the cost, as in `shrinking_force`. Noise in the rays, and ground that is not flat, lift and
+    lower the solved poses. Planar poses do not measure heights. Their noise only says how large heights may be. In a smaller
+    map, all heights are smaller and cost less, but this says nothing about the true size. The motions by odometry are left
+    out, because their noise follows the odometry's scale.
     """
     keyframes = of.measured.keyframes
     if not keyframes.localized_every or not is_planar(keyframes.map_T_base):
@@ -73,10 +74,10 @@ def force_of_heights(of: Linearised) -> float:
 
 
 def _by_heights(base_T_camera: Floats, off: Floats, roots: Floats) -> float:
-    """Return the derivative of the cost by the logarithm of all heights.
+    """Return the derivative of the cost by the logarithm of a factor on all heights.
 
     base_T_camera: (n, 4, 4). off: (n, 6) the twists between solved and measured poses or motions, in the camera frames.
-    roots: (n, 6, 6) matrices that whiten them.
+    roots: (n, 6, 6) matrices that whiten the twists.
     """
     height = (adjoint(base_T_camera)[:, _HEIGHT] * off).sum(axis=1)
     raised = adjoint(inverse(base_T_camera))[:, :, _HEIGHT] * height[:, None]
@@ -86,7 +87,8 @@ def _by_heights(base_T_camera: Floats, off: Floats, roots: Floats) -> float:
 def _of_tags(of: Linearised) -> float:
     """Return the information that the known sizes of fiducials give about the logarithm of the size of the map.
 
-    A view gives the distance to a fiducial by the directions of four corners, each half a diagonal from the centre.
+    A view gives the distance to a fiducial from the directions of its four corners. Each corner is half a diagonal from the
+    centre.
     """
     tags = of.measured.tags
     if tags is None:

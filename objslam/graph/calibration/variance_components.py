@@ -1,7 +1,8 @@
-"""Estimate the noise of a log's measurements from its residuals: iterated variance components (Koch 1999, 3.6).
+"""Estimate the noise of a log's measurements from its residuals, by iterated variance components (Koch 1999, 3.6).
 
-Each kind of noise gets the size for which the squares of its residuals sum up to their redundancy. The redundancy is the
-part of the residuals that poses, landmarks and shared errors do not absorb. Random probes measure it (Hutchinson 1990).
+Each kind of noise gets the size for which the squares of its whitened residuals sum up to their redundancy. The redundancy
+is the part of the residuals that poses, landmarks and shared errors do not absorb. Random probes measure it (Hutchinson
+1990).
 """
 
 from dataclasses import dataclass, replace
@@ -31,28 +32,30 @@ _PROBES, _FEWEST_PROBES = 12, 4
 """The most and the fewest random probes. With n independent residuals, the relative error of the redundancy is
 sqrt(2 / (n * probes)). More probes are slower."""
 _PRODUCTS = 3000
-"""There are enough probes if their number times the number of independent residuals is this. The redundancy then has a
-standard deviation of 3 %, and a factor has half of that. So a long log needs fewer probes than `_PROBES`. A larger number is
-more exact, and slower."""
+"""The number of probes, times the number of independent residuals, that is enough. With 3000, the redundancy has a standard
+deviation of 3 %, and a factor has half of that. So a long log needs fewer probes than `_PROBES`. A larger number is more
+exact and slower."""
 _ITERATIONS = 20
-"""The most iterations. Each takes a factorisation of the linear system, so more are slower. MRCLAM takes 5 to 12."""
+"""The most iterations. Each iteration factorises the linear system, so more are slower. The MRCLAM robots take 5 to 12."""
 _CONVERGED = 0.01
-"""The iteration ends if all factors change by less than this share. A factor that the log hardly determines changes slowly.
-With a larger share, the iteration ends before this factor has its value: with 0.02, one MRCLAM robot without ranges got 2.2
-instead of 2.8."""
+"""The relative change of all factors below which the iteration ends. A factor that the log hardly determines changes slowly.
+With a larger value, the iteration ends before such a factor has its value. With 0.02, one MRCLAM robot without ranges got
+2.2 instead of 2.8."""
 _LIMITS = (0.05, MOST_NOISE)
-"""The smallest and largest factors on a nominal noise. Outside them, the settings do not describe the sensor at all."""
+"""The smallest and the largest factor on a nominal noise. Beyond them, the settings do not describe the sensor at all."""
 _SHORTEST, _LONGEST = 3.0, 6.0
 """The bounds of `correlation_time`, s. Wheels lag behind a command, and a detector's box is off, for one or two seconds.
-Slip lasts as long as the ground and the load: the speeds of five robots (MRCLAM, against motion capture) had errors with a
-correlation of 0.5 after 2 s, 1/e after 4 s and 0.3 after 6 s. Longer times find slower errors, from fewer sums."""
+Slip lasts as long as the ground and the load stay the same. The speeds of five robots (MRCLAM, against motion capture) had
+errors with a correlation of 0.5 after 2 s, 1/e after 4 s and 0.3 after 6 s. Longer times show slower errors, from fewer
+sums."""
 _WINDOWS = 30
-"""The number of windows that `correlation_time` leaves in a log. The variance of this number of sums is known to 26 %. A
-larger number shortens the windows of short logs."""
+"""The number of windows into which `correlation_time` divides a log, within its bounds. The variance of 30 sums is known to
+26 %. A larger number shortens the windows."""
 _MOST_SHRINKAGE = 0.3
-"""The largest shrinkage (a share) that is corrected. A larger one has another cause, which a larger limit hides."""
+"""The largest shrinkage that is corrected, as a share of the size. A larger shrinkage has another cause, which a larger
+limit would hide."""
 _KINDS = ("rays", "ranges", "range_bias", "along", "across", "turning")
-"""The factors that this iteration estimates, as fields of `NoiseFactors`."""
+"""The names of the factors that the iteration estimates. They are fields of `NoiseFactors`."""
 _MEAN_NORMAL = np.sqrt(np.pi / 2)
 """The factor from the mean absolute value of Gaussian numbers to their standard deviation."""
 
@@ -62,10 +65,10 @@ class _Rows:
     """A description of the rows of a linear system: n bearings, q ranges and s motions, with their nominal noise.
 
     bearing_axes: (n, 2, 2) turn the two rows of a bearing into azimuth and elevation. bearing_weight: (n,) robust weights.
-    ranges: of the ranges. label_names: (L,). motions: in the graph. parts: (3, s, 6, 6) their covariances by the noise
-    along, across and in turning. rest: (s, 6, 6) by the noise of `planar`. motion_axes: (3, s, 6) twists along, across and
-    in turning, in the camera frame after the motion. motion_window: (s,), ray_window: (n,) the window of each motion and
-    ray. The errors in a window may be correlated.
+    ranges: the noise of the ranges. label_names: (L,). motions: the motions in the graph. parts: (3, s, 6, 6) covariances of
+    the motions by the noise along, across and in turning. rest: (s, 6, 6) covariances by the noise of `planar`. motion_axes:
+    (3, s, 6) twists along, across and in turning, in the camera frame after the motion. motion_window: (s,) the window of
+    each motion. ray_window: (n,) the window of each ray. The errors in a window may be correlated.
     """
 
     bearing_axes: Floats
@@ -101,8 +104,8 @@ def estimate_noise(
 ) -> NoiseFactors:
     """Return the noise that agrees best with the residuals of a solved graph, as factors on the nominal noise.
 
-    system: of the graph, with the noise `errors.noise`, at the shared errors theta (P,). prior_residuals: the weight of the
-    nominal noise in each kind, as a number of residuals. Kinds of noise that are known keep their factor.
+    Kinds of noise that are known keep their factor. system: the linear system of the graph, with the noise `errors.noise`,
+    at the shared errors theta (P,). prior_residuals: the weight of the nominal noise of each kind, as a number of residuals.
     """
     kinds, rows = errors.unknown_noise, _rows(of, errors, theta)
     if not kinds - {"localization"}:
@@ -181,11 +184,12 @@ def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Row
 
 
 def _left(jacobian: sparse.csr_matrix, normal: Equations, sides: Floats, prior: Floats, told: Floats) -> Floats:
-    """Return the residuals of `told` (M + P, n) after a least-squares solution.
+    """Return the residuals of columns `told` (M + P, n) after a least-squares fit by all variables and shared errors.
 
-    jacobian: (M, D) by poses and landmarks. normal: its normal equations. sides: (M, P) by the shared errors. prior: (P, P)
-    the last P rows by the shared errors. The sides are dense, so a Schur complement eliminates them last. As columns of
-    the sparse matrix, they would slow its factorisation down by a factor of four.
+    jacobian: (M, D) the derivatives by poses and landmarks. normal: the normal equations of the Jacobian. sides: (M, P) the
+    derivatives by the shared errors. prior: (P, P) the derivatives of the last P rows by the shared errors. The sides are
+    dense, so a Schur complement eliminates the shared errors last. As columns of the sparse matrix, the sides would make its
+    factorisation four times as slow.
     """
     both = np.hstack([sides, told[: len(sides)]])
     both = both - jacobian @ normal.solve(jacobian.T @ both)
@@ -198,8 +202,8 @@ def _left(jacobian: sparse.csr_matrix, normal: Equations, sides: Floats, prior: 
 class _Rescaling:
     """A change of the noise that whitens M rows, from the noise `begin` to another noise.
 
-    system, rows: the rows. begin: the noise. colours: (s, 6, 6) undo the whitening of the motions. pattern: the sparse
-    matrix (M, M) of the change: the columns of its entries, row by row, and the first entry of each row.
+    system, rows: the rows. colours: (s, 6, 6) matrices that undo the whitening of the motions. pattern: the columns of the
+    entries, row by row, and the first entry of each row, in the sparse matrix (M, M) of the change.
     """
 
     system: LinearSystem
@@ -210,7 +214,7 @@ class _Rescaling:
 
     @classmethod
     def of(cls, system: LinearSystem, rows: _Rows, begin: NoiseFactors, whitens: Floats) -> Self:
-        """Prepare the change. whitens: (s, 6, 6) of the motions, for the noise `begin`."""
+        """Prepare the change. whitens: (s, 6, 6) matrices that whiten the motions, for the noise `begin`."""
         size, first = len(system.residual), system.first_motion
         last = first + whitens.size // 6
         blocks = np.repeat(np.arange(first, last).reshape(-1, 6), 6, axis=0)
@@ -220,8 +224,10 @@ class _Rescaling:
         return cls(system, rows, begin, np.asarray(np.linalg.inv(whitens)), (columns, np.append(0, np.cumsum(lengths))))
 
     def to(self, noise: NoiseFactors, whitens: Floats) -> tuple[sparse.csr_matrix, ChainRows | None]:
-        """Return the matrix (M, M) for another noise, and the rows of a chain for this noise. whitens: (s, 6, 6) of the
-        motions, for this noise."""
+        """Return the matrix (M, M) of the change to another noise, and the rows of a chain for this noise.
+
+        whitens: (s, 6, 6) matrices that whiten the motions, for this noise.
+        """
         system, rows, size = self.system, self.rows, len(self.system.residual)
         scale = np.ones(size)
         scale[: system.first_range] = self.begin.rays / noise.rays
@@ -246,8 +252,9 @@ def _updated(
 ) -> NoiseFactors:
     """Return the noise after one step of the iteration.
 
-    whitens: (s, 6, 6) of the motions, for the present noise. kinds: the kinds of noise to estimate. left: (M, probes + 1)
-    the probes and residuals after the solution. prior: the weight of the nominal noise, as a number of residuals.
+    whitens: (s, 6, 6) matrices that whiten the motions, for the present noise. kinds: the kinds of noise to estimate. left:
+    (M + P, probes + 1) what a least-squares fit leaves of the probes and the residuals. prior: the weight of the nominal
+    noise, as a number of residuals.
     """
     found: dict[str, Any] = noise.to_dict(None)
     residual, kept, count = left[:, -1], left[:, :-1], probes.shape[1]
@@ -280,9 +287,10 @@ def _updated(
 
 
 def _ray_noise(rows: _Rows, factor: float, residual: Floats, probes: Floats, kept: Floats, prior: float) -> float:
-    """Return the factor on the noise of rays. It is larger if rays of one object have correlated errors for a while.
+    """Return the factor on the noise of rays. It is larger if the rays of one object have correlated errors for some time.
 
-    The mean of absolute values is robust. The larger of azimuth and elevation counts, because a sensor may fix one of them.
+    The mean of absolute values is used, because it is robust. The larger factor of azimuth and elevation counts, because a
+    sensor may fix one of the two.
     """
     axes, count = rows.bearing_axes, len(rows.bearing_weight)
     off = np.einsum("njk,nk->nj", axes, residual[: 2 * count].reshape(-1, 2)) / np.sqrt(rows.bearing_weight)[:, None]
@@ -312,7 +320,7 @@ def _range_rows(of: Linearised, errors: CalibratedMeasurements) -> RangeNoise:
 
 
 def _range_sigma(rows: _Rows, noise: NoiseFactors) -> Floats:
-    """Return the noise (q,), m, of ranges, with their share of the object's bias."""
+    """Return the noise (q,), m, of ranges, with their part of the object's bias."""
     return rows.ranges.total(noise.of_labels(rows.label_names))
 
 

@@ -1,4 +1,5 @@
-"""The bodies of objects: upright ellipsoids, cuboids and cylinders, their fit to the edges of boxes, and the choice of one.
+"""Fit a body to the edges of each object's boxes, and choose its shape.
 
-A body has seven parameters. All objects of a map are solved in one batch, in numpy.
+A body is an upright ellipsoid, cuboid or cylinder with seven parameters. All objects of a map are solved in one batch, in
+numpy.
 """

@@ -1,7 +1,8 @@
-"""The choice between a point, a sphere, an ellipsoid, a cuboid and a cylinder by their evidence (Laplace; MacKay 1992).
+"""Choose between a point, a sphere, an ellipsoid, a cuboid and a cylinder by their evidence (Laplace; MacKay 1992).
 
-A point explains the place of a box, but not its size, so each size is equally probable. A body explains both. But it has
-more parameters, and the wider their priors are, the lower is its evidence (Occam's factor).
+A point explains the place of a box, but not the size of the box. So each size is equally probable for a point. A body
+explains both, but a body has more parameters. The wider the priors of its parameters are, the lower is the evidence of the
+body (Occam's factor).
 """
 
 from __future__ import annotations
@@ -14,25 +15,25 @@ from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import Fit, Prior, Weights
 
 _EQUAL = 1.0
-"""The prior of the shares of shapes weighs as much as this number of things of each shape. With a larger number, the other
-things of a log say less about the shape of one."""
+"""The weight of the prior of the shares of shapes, as a number of things of each shape. With a larger number, the other
+things of a log say less about the shape of one thing."""
 _MOST = 6.0
-"""The other things of a label count as at most this number of things, and so do the other things of a log. If their true
-shape is not among the tried shapes, all of them have the same error, so a hundred say little more than a few. With a larger
-number, the shape of one thing is surer."""
+"""The most things as which the other things of a label count. The same number limits the other things of a log. If the true
+shape of things is not among the tried shapes, all have the same error, so a hundred say little more than a few. With a
+larger number, the shape of one thing is surer."""
 _REPEATS = 20
-"""How often `with_shares_of_shapes` repeats its expectation. More are slower and change little."""
+"""How often `with_shares_of_shapes` repeats its expectation. More repetitions are slower and change little."""
 
 
 def log_evidence(
     edges: BoxEdges, fit: Fit, prior: Prior, weights: Weights, side: Floats, *, free: Bools | None = None
 ) -> Floats:
-    """Return the logarithm of the evidence (N,) of a fit.
+    """Return the logarithm (N,) of the evidence of fitted bodies.
 
-    side: (B,) px, half the length of the image. A measurement that the shape does not explain is uniform over this length.
-    free: (B, 4) the shifts and sizes that a point does not explain, None for other shapes. Other shapes explain all
-    measurements except bounds that the body reaches. Boxes from one direction share an error, so together they count as one
-    measurement.
+    Boxes from one direction share an error, so together they count as one measurement. side: (B,) px, half the length of the
+    image. A measurement that the shape does not explain is uniform over this length. free: (B, 4) a mask of the shifts and
+    sizes that a point does not explain, None for other shapes. Other shapes explain all measurements except those whose
+    `Residuals.use` is 0.
     """
     now, spread, worth = fit.found, weights.spread[:, :4], np.minimum(weights.spread**2 / weights.variance, 1.0)[:, :4]
     unexplained = now.use[:, :4] == 0 if free is None else free
@@ -48,14 +49,14 @@ def log_evidence(
 
 
 def with_shares_of_shapes(evidence: Floats, label: Ints) -> Floats:
-    """Return the logarithm of the evidence (S, N), plus the logarithm of the share of each shape among the other things.
+    """Return the logarithm (S, N) of the evidence, plus the logarithm of the share of each shape among the other things.
 
     The boxes of one thing often hardly show whether it is an ellipsoid or a cylinder. But things of one label are alike, and
-    so are the things of a room. So a shape gets more probable if other things of the label have it. With few such things,
-    the shares of the shapes in the whole log count, and with few things in the log, equal shares. The shapes of the other
-    things are not known either, so each share is an expectation (CVB0; Asuncion et al. 2009).
+    so are the things of a room. So a shape gets more probable if other things of the label have it. If few things have the
+    label, the shares of the shapes in the whole log count. If the log has few things, equal shares count. The shapes of the
+    other things are not known either, so each share is an expectation (CVB0; Asuncion et al. 2009).
 
-    evidence: (S, N) the logarithm of the evidence of each shape. label: (N,).
+    evidence: (S, N) the logarithm of the evidence of each shape. label: (N,) the label of each thing.
     """
     shapes, things = evidence.shape
     own = np.unique(label, return_inverse=True)[1].ravel()
@@ -71,7 +72,7 @@ def with_shares_of_shapes(evidence: Floats, label: Ints) -> Floats:
 
 
 def _told(number: Floats) -> Floats:
-    """Return numbers (S, N) of things of each shape, in which all things together count as at most `_MOST`."""
+    """Return numbers (S, N) of things of each shape, scaled down where their sum over the shapes exceeds `_MOST`."""
     return np.asarray(number * np.minimum(1.0, _MOST / np.maximum(number.sum(axis=0), 1e-12)))
 
 
@@ -79,10 +80,10 @@ def shapes_disagree(evidence: Floats, axes: Floats, chosen: Ints) -> Floats:
     """Return the covariances (N, A, A) that show how much bodies of other shapes, weighted by their evidence, differ from
     the chosen bodies.
 
-    evidence: (S, N) the logarithm of the evidence of each shape. axes: (S, N, A) centres and half axes, m, of the bodies of
-    each shape, NaN for what a shape does not have. chosen: (N,). The result is the second moment about the chosen shape. The
-    covariance of a mixture contains it, besides the covariances of its parts (Hoeting et al. 1999, Bayesian model
-    averaging).
+    The result is the second moment about the chosen shape. The covariance of a mixture is the sum of this moment and the
+    mean covariance of the parts (Hoeting et al. 1999, Bayesian model averaging). evidence: (S, N) the logarithm of the
+    evidence of each shape. axes: (S, N, A) centres and half axes, m, of the bodies of each shape, NaN for half axes that a
+    shape does not have. chosen: (N,) the index of the chosen shape.
     """
     chance = np.exp(evidence - evidence.max(axis=0))
     chance /= chance.sum(axis=0)

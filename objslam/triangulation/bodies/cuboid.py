@@ -1,7 +1,8 @@
 """Upright cuboids by seven parameters.
 
 The parameters are the centre x, y, z (m), p, q, the yaw (rad), and k. p is the mean of the logarithms of the two horizontal
-half axes, and q is half their difference, which may be negative. k is the logarithm of the half axis upwards.
+half axes (m). q is half the difference of the two logarithms, and may be negative. k is the logarithm of the half axis
+upwards (m).
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats, Ints
 
 _FLAT = 1e-12
-"""The least component of a ray's direction along an axis. A larger value distorts rays along a face."""
+"""The least component of a ray's unit direction along an axis of the cuboid. It prevents a division by zero. A larger value
+distorts rays that are nearly parallel to a face."""
 
 
 def _half(values: Floats) -> Floats:
@@ -27,7 +29,7 @@ def _local(values: Floats, vectors: Floats) -> Floats:
 
 
 def support(values: Floats, body: Ints, normals: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the support of cuboids (see `shapes.Kind`): the plane touches the corner that is farthest along its normal."""
+    """Return the support of cuboids (see `shapes.Kind`). A plane touches the corner that is farthest along its normal."""
     cos, sin = (part(values[:, 5])[body, None] for part in (np.cos, np.sin))
     half = _half(values).T[:, body, None]
     x, y, z = np.moveaxis(normals, -1, 0)
@@ -49,7 +51,7 @@ def sides(values: Floats, touched: Floats) -> Floats:
 
 
 def ranges(values: Floats, origins: Floats, directions: Floats) -> tuple[Floats, Floats, Bools]:
-    """Return the ranges of cuboids (see `shapes.Kind`): the last of the three slabs that a ray enters (Kay, Kajiya 1986)."""
+    """Return the ranges of cuboids (see `shapes.Kind`). A ray hits where it enters its last slab (Kay, Kajiya 1986)."""
     start, along, half = _local(values, origins - values[:, :3]), _local(values, directions), _half(values)
     sign, steep = np.sign(along), np.maximum(np.abs(along), _FLAT)
     enter, leave = (-sign * start - half) / steep, (-sign * start + half) / steep

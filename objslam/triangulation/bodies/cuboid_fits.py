@@ -1,4 +1,4 @@
-"""The fits of cuboids from several starts, and the choice between the fits of two shapes."""
+"""Fit cuboids from several starts, and join the fits of two shapes."""
 
 from __future__ import annotations
 
@@ -15,23 +15,28 @@ from objslam.triangulation.bodies.residuals import Residuals
 from objslam.triangulation.bodies.shapes import CUBOID, ELLIPSOID
 
 _TURNS = np.radians([0.0, 22.5, 45.0, 67.5])
-"""The headings (rad) at which square cuboids are fitted, relative to the best cuboid so far. A square repeats after a
-quarter turn. In simulations of things seen over 30 degrees, four headings always found the best cuboid, and two missed it
-for one thing in 20. More headings are slower."""
+"""The headings (rad), relative to the best cuboid so far, at which fits of cuboids start. Each start has a square section,
+which repeats after a quarter turn. In simulations of things seen over 30 degrees, four headings always found the best
+cuboid, and two headings missed it for one thing in 20. More headings are slower."""
 _ONE_SIDE = np.radians(35.0)
-"""A thing was seen from one side if no view is farther (rad) from the mean view. In simulations, cuboids seen over 60
-degrees and more had one clear heading. A larger angle searches at more things."""
+"""The largest angle (rad) between a view and the mean view of a thing that was seen from one side only. In simulations,
+cuboids seen over 60 degrees and more had one clear heading. With a larger angle, other headings are tried for more
+things."""
 _RIVAL = 15.0
-"""Other headings of a cuboid are tried, unless the evidence (ln) of another shape is higher by more than this. Another
-heading has raised the evidence by up to 11. A larger number searches at more things."""
+"""The lead of another shape in the logarithm of the evidence, above which no other headings of a cuboid are tried. Another
+heading has raised the logarithm by up to 11. With a larger number, other headings are tried for more things."""
 _SAME = 0.005
-"""Two cuboids are one if no centre and no half axis differs by more than this (m). A larger length merges more of them."""
+"""The difference (m) of each centre coordinate and half axis below which two cuboids count as one. A larger length merges
+more cuboids."""
 
 
 @dataclass(frozen=True)
 class OtherCuboids:
-    """M other cuboids of each of N bodies. values: (M, N, 7). evidence: (M, N) the logarithm of their evidence, -inf for a
-    cuboid that is missing or the same as another one."""
+    """M other cuboids for each of N bodies.
+
+    values: (M, N, 7) the parameters. evidence: (M, N) the logarithm of the evidence of each cuboid, -inf for a cuboid that
+    is missing or the same as another one.
+    """
 
     values: Floats
     evidence: Floats
@@ -48,7 +53,7 @@ class OtherCuboids:
 
 
 def cuboid_starts(rounds: Floats) -> tuple[Floats, Floats]:
-    """Return two starts (N, 7) of cuboids, along the axes of ellipsoids (N, 7) and at 45 degrees to them."""
+    """Return two starts (N, 7) of cuboids: along the axes of ellipsoids (N, 7), and at 45 degrees to these axes."""
     starts = []
     for turn in (0.0, np.pi / 4):
         start = rounds.copy()
@@ -95,8 +100,8 @@ def all_headings(
 ) -> tuple[Fit, Floats, OtherCuboids]:
     """Search for better cuboids at other headings, for things that were seen from one side.
 
-    The boxes of such a thing fit cuboids with several headings and depths. A fit ends at one of them, and it may be far less
-    probable than another.
+    The boxes of such a thing fit cuboids with several headings and depths. A fit ends at one such cuboid, and this
+    cuboid may be far less probable than another one.
 
     Args:
         found: the fits of the cuboids so far.
@@ -106,7 +111,7 @@ def all_headings(
         side: (B,) as in `log_evidence`.
 
     Returns:
-        The best cuboids, their evidence (N,), and the other cuboids.
+        The best cuboids, the logarithm (N,) of their evidence, and the other cuboids.
     """
     which = np.flatnonzero((evidence > rival - _RIVAL) & seen_from_one_side(edges, found.values[:, :3]))
     if not len(which):
@@ -133,7 +138,7 @@ def all_headings(
 
 
 def _repeated(others: OtherCuboids, chosen: Ints) -> Bools:
-    """Return which cuboids (M, N) equal the chosen cuboid or an earlier one."""
+    """Return a mask (M, N) of the cuboids that equal the chosen cuboid or an earlier one."""
     axes = others.axes
     same = np.abs(axes[:, None] - axes[None]).max(axis=3) < _SAME  # (M, M, N)
     repeated = np.array([same[at, :at].any(axis=0) for at in range(len(axes))])

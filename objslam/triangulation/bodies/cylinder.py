@@ -1,6 +1,7 @@
 """Upright cylinders with an elliptic section, by the seven parameters of an ellipsoid (see `ellipsoid`).
 
-The section of the cylinder is the horizontal section of this ellipsoid, and its half axis upwards is the half of the height.
+The section of the cylinder is the horizontal section of this ellipsoid. Half the height of the cylinder is the half axis
+upwards of the ellipsoid.
 """
 
 from __future__ import annotations
@@ -15,14 +16,15 @@ __all__ = ["axes_jacobian", "half_axes", "heading", "ranges", "support"]
 _LEAST = 1e-9
 """The least length (m) of a divisor. A larger length distorts small bodies."""
 _FLAT = 1e-12
-"""The least component of a ray's direction upwards or across. A larger value distorts rays along a face."""
+"""The least squared or vertical component of a ray in a divisor, without a unit. It prevents a division by zero. A larger
+value distorts rays that are nearly parallel to a face."""
 
 
 def support(values: Floats, body: Ints, normals: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the support of cylinders (see `shapes.Kind`). It is the sum of the supports of the horizontal section and of
-    the vertical axis.
+    """Return the support of cylinders (see `shapes.Kind`): the support of the section plus that of the vertical axis.
 
-    The support of a sum of two sets is the sum of their supports (Schneider 2014, Convex Bodies, section 1.7).
+    A cylinder is the sum of the two sets, and the support of a sum of two sets is the sum of their supports (Schneider
+    2014, Convex Bodies, section 1.7).
     """
     form, half = forms(values)[:, body, None], np.exp(values[body, None, 6])
     x, y, z = np.moveaxis(normals, -1, 0)
@@ -42,7 +44,7 @@ def sides(values: Floats, touched: Floats) -> Floats:
 
 
 def ranges(values: Floats, origins: Floats, directions: Floats) -> tuple[Floats, Floats, Bools]:
-    """Return the ranges of cylinders (see `shapes.Kind`): where a ray has entered both the tube and the slab."""
+    """Return the ranges of cylinders (see `shapes.Kind`). A ray hits where it has entered both the tube and the slab."""
     start, half = origins - values[:, :3], np.exp(values[:, 6])
     inverse = np.linalg.inv(matrices(values)[:, :2, :2])
     flat, from_axis = directions[:, :2], start[:, :2]

@@ -1,8 +1,8 @@
 """Upright ellipsoids by seven parameters without a singularity.
 
 The parameters are the centre x, y, z (m), three numbers p, q, s of the horizontal section, and the logarithm k of the half
-axis upwards. The horizontal section has the matrix exp(2 [[p + q, s], [s, p - q]]) of squared half axes. So a round section
-needs no yaw, and a prior around q = s = 0 prefers no direction.
+axis upwards (m). The matrix of squared half axes of the horizontal section is exp(2 [[p + q, s], [s, p - q]]). So a round
+section needs no yaw, and a prior around q = s = 0 prefers no direction.
 """
 
 from __future__ import annotations
@@ -12,16 +12,18 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats, Ints
 
 _ROUND = 1e-3
-"""A series replaces a division by the aspect, sqrt(q^2 + s^2), below this. With a larger value, the series is less exact."""
+"""The aspect, sqrt(q^2 + s^2), below which a series replaces a division by the aspect. With a larger value, the series is
+less exact."""
 _LEAST = 1e-9
 """The least length (m) of a divisor. A larger length distorts small bodies."""
 
 
 def forms(values: Floats) -> Floats:
-    """Return ten numbers (10, N) of ellipsoids (N, 7).
+    """Return ten numbers (10, N) that give the form v^T M v of ellipsoids (N, 7) for any vector v = (x, y, z).
 
-    The first nine are the factors of x^2 + y^2, of x^2 - y^2 and of 2 x y: first in the horizontal part of v^T M v, then in
-    its derivatives by q and by s. The last one is the factor of z^2 in v^T M v.
+    M is the matrix of squared half axes. Numbers 1 to 3 are the factors of x^2 + y^2, x^2 - y^2 and 2 x y in the form.
+    Numbers 4 to 6 are the same factors in the derivative of the form by q, and numbers 7 to 9 in its derivative by s. The
+    last number is the factor of z^2 in the form.
     """
     p, q, s, k = values[:, 3:].T
     aspect2 = q * q + s * s
@@ -40,8 +42,8 @@ def forms(values: Floats) -> Floats:
 def section(form: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
     """Return the quadratic form v^T M v (...,) of vectors v = (x, y, z), and its derivatives (..., 4) by p, q, s and k.
 
-    form: (10, ...) of `forms`, of the ellipsoid of each vector. M is the matrix of squared half axes. If v is the unit
-    normal of a tangent plane, the square root of the form is the distance of this plane from the centre.
+    M is the matrix of squared half axes. If v is the unit normal of a tangent plane, the square root of the form is the
+    distance of this plane from the centre. form: (10, ...) from `forms`, for the ellipsoid of each vector.
     """
     across, along, cross, upward = x * x + y * y, x * x - y * y, 2 * x * y, form[9] * z * z
     by = np.empty((*across.shape, 4), order="F")
@@ -51,7 +53,7 @@ def section(form: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floa
 
 
 def support(values: Floats, body: Ints, normals: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the support of ellipsoids (see `shapes.Kind`): the root of n^T M n (the dual quadric)."""
+    """Return the support of ellipsoids (see `shapes.Kind`): the square root of n^T M n for a normal n (the dual quadric)."""
     form = forms(values)[:, body, None]
     x, y, z = np.moveaxis(normals, -1, 0)
     squared, by = section(form, x, y, z)
@@ -61,7 +63,10 @@ def support(values: Floats, body: Ints, normals: Floats) -> tuple[Floats, Floats
 
 
 def touched(form: Floats, x: Floats, y: Floats, z: Floats, distance: Floats) -> Floats:
-    """Return M n (B, 4, 3) of normals n = (x, y, z), each divided by a distance (B, 4). form: as in `section`."""
+    """Return the products M n (B, 4, 3) for normals n = (x, y, z), each divided by a distance (B, 4), m.
+
+    If the distance is the support, the result is the touched point relative to the centre, m. form: as in `section`.
+    """
     points = np.empty((*distance.shape, 3), order="F")
     points[..., 0] = ((form[0] + form[1]) * x + form[2] * y) / distance
     points[..., 1] = (form[2] * x + (form[0] - form[1]) * y) / distance
@@ -114,7 +119,7 @@ def heading(values: Floats) -> Floats:
 def axes_jacobian(values: Floats) -> Floats:
     """Return the derivatives (N, 7, 7) of centre, half axes and yaw by the parameters of ellipsoids (N, 7).
 
-    A round section has no yaw. Its derivatives are computed at an aspect of 1e-3.
+    A round section has no yaw. The derivatives of its yaw are computed at an aspect of 1e-3.
     """
     half, twice = half_axes(values), 2 * heading(values)
     aspect = np.maximum(np.hypot(values[:, 4], values[:, 5]), _ROUND)

@@ -1,4 +1,4 @@
-"""Fit bodies to the boxes of objects: robust, damped Gauss-Newton steps for all objects at once."""
+"""Fit bodies to the boxes of objects by robust, damped Gauss-Newton steps for all objects at once."""
 
 from __future__ import annotations
 
@@ -14,32 +14,37 @@ from objslam.triangulation.bodies.residuals import ROWS, Residuals, residuals
 from objslam.triangulation.bodies.shapes import PARAMETERS, Kind
 
 _ITERATIONS = 40
-"""The most steps of a fit. Ten are usual. More steps are slower."""
+"""The most steps of a fit. Usually a fit takes ten. More steps are slower."""
 STILL = 1e-9
-"""The fit of a body goes on as long as the linear model of a step predicts a decrease of the cost by at least this. The cost
-is half the sum of squared deviations. A larger value ends sooner."""
+"""The predicted decrease of the cost in a step below which the fit of a body ends. The cost is half the sum of squared
+deviations. A larger value ends the fit sooner."""
 ENOUGH = 1e-3
-"""This limit replaces `STILL` in a fit that only chooses a shape. A larger value ends sooner."""
+"""The limit that replaces `STILL` in a fit that only chooses a shape. A larger value ends the fit sooner."""
 STEPS = 12
 """The most steps of a fit that chooses a shape. A fit of the right shape needs fewer. More steps are slower."""
 _UPHILL = 1e-3
-"""A step may raise the cost by this share. The derivatives leave out that the distance to a body changes, so steps near the
+"""The share by which a step may raise the cost. The derivatives ignore changes of the distance to a body, so steps near the
 optimum may raise the cost slightly. A larger share accepts worse steps."""
 _DAMPING = (1e-3, 1e-9, 1e6)
-"""The first, least and most damping of a step, as a share of the curvature. More damping makes shorter steps."""
+"""The first, the least and the most damping of steps, as shares of the curvature. More damping makes shorter steps."""
 _LONGEST = 0.7
-"""The longest step of a logarithm or an angle (rad). A longer step may leave the region in which the linear model holds."""
+"""The longest step of a parameter that is a logarithm or an angle (rad). A longer step may leave the region in which the
+linear model holds."""
 _REMAIN = 0.7
-"""If less than this share of the bodies is unfinished, only these bodies get more steps. A larger share copies their data
-more often."""
+"""The share of unfinished bodies below which their data are copied, so that only they get more steps. With a
+larger share, data are copied more often."""
 _MANY = 20
-"""With at least this mean number of boxes a body, a matrix product for each body is faster than a small product for each box
-(measured). A larger number uses it more rarely. Both give the same sums."""
+"""The mean number of boxes of a body from which on one matrix product for each body is used. With fewer boxes, a small
+product for each box is faster (measured). Both give the same sums. With a larger number, small products are used more
+often."""
 
 
 @dataclass(frozen=True)
 class Prior:
-    """A Gaussian prior on the parameters of N bodies. mean: (N, 7). information: (N, 7, 7)."""
+    """A Gaussian prior on the parameters of N bodies.
+
+    mean: (N, 7). information: (N, 7, 7), the inverse of the covariance.
+    """
 
     mean: Floats
     information: Floats
@@ -49,9 +54,9 @@ class Prior:
 class Weights:
     """How much the residuals of boxes count.
 
-    spread: (B, 5) the standard deviation of a residual. variance: (B, 5) the variance with which it counts. This is larger
-    than spread^2 if residuals share an error, so that many of them count as few. robust: whether residuals far beyond their
-    spread count less (Cauchy's weight).
+    spread: (B, 5) the standard deviation of each residual. variance: (B, 5) the variance with which a residual counts. It is
+    larger than spread^2 if residuals share an error, so that many residuals count as few. robust: whether residuals far
+    beyond their spread count less (Cauchy's weight).
     """
 
     variance: Floats
@@ -61,9 +66,10 @@ class Weights:
 
 @dataclass(frozen=True)
 class Fit:
-    """The best bodies. values: (N, 7). found: the residuals of the B boxes. weight: (B, 5) of each residual, 1 / variance.
+    """The best bodies of N objects with B boxes.
 
-    information: (N, 7, 7) of boxes and prior. prior: (N, 7, 7) of the prior alone.
+    values: (N, 7) the parameters. found: the residuals of the boxes. weight: (B, 5) the weight of each residual, 1 /
+    variance. information: (N, 7, 7) from boxes and prior. prior: (N, 7, 7) the information of the prior alone.
     """
 
     values: Floats
@@ -83,7 +89,10 @@ def fit(
     still: float = STILL,
     most: int = _ITERATIONS,
 ) -> Fit:
-    """Return the most probable bodies of one kind. start: (N, 7). still: see `STILL`. most: the most steps."""
+    """Return the most probable bodies of one kind.
+
+    start: (N, 7) the parameters at which the fit starts. still: see `STILL`. most: the most steps.
+    """
     values, now = start.copy(), residuals(edges, start, kind)
     moving = np.arange(len(start))
     damping = np.full(len(start), _DAMPING[0])
@@ -119,10 +128,10 @@ def _steps(
     kind: Kind,
     limits: tuple[int, int, float],
 ) -> tuple[Floats, Floats, Residuals, Bools, int]:
-    """Take steps until few bodies are unfinished. Return bodies, dampings, residuals, which bodies are finished, and the
-    steps so far.
+    """Take steps until few bodies are unfinished.
 
-    now: the residuals before. limits: the number of steps so far, the most steps, and the value for `STILL`.
+    Return the bodies (N, 7), the dampings (N,), the residuals, a mask (N,) of finished bodies, and the number of steps so
+    far. now: the residuals before. limits: the number of steps so far, the most steps, and the value for `STILL`.
     """
     steps, most, enough = limits
     still = np.zeros(len(values), dtype=bool)
@@ -150,8 +159,10 @@ def _chosen(which: Bools, new: Residuals, old: Residuals) -> Residuals:
 
 
 def grouped(group: Ints, rows: Floats, count: int) -> Floats:
-    """Add up the rows (B, ...) of each group, and return the sums (count, ...). It is fastest if the groups (B,) are in
-    order."""
+    """Return the sums (count, ...) of the rows (B, ...) of each group.
+
+    group: (B,) the group of each row. The sums are the fastest if the groups are in order.
+    """
     total = np.zeros((count, *rows.shape[1:]))
     if not len(group):
         return total
@@ -169,14 +180,14 @@ def _weight(now: Residuals, weights: Weights) -> Floats:
     if not weights.robust:
         return weight
     squared = now.use * (now.value / weights.spread) ** 2
-    # If a box is of another thing, all its edges are wrong, so all four residuals of a box get one weight.
+    # If a box shows another thing, all its edges are wrong. So the four residuals of its edges get one weight.
     squared[:, : ROWS - 1] = squared[:, : ROWS - 1].sum(axis=1, keepdims=True) / 2
     return np.asarray(weight / (1 + squared / CAUCHY_K**2))
 
 
 def _normal(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the information (N, 7, 7), the gradient (N, 7) and the cost (N,) of the bodies."""
-    rooted = np.empty(now.rows.shape)  # Each box lies together in memory, because the sums run over the boxes of a body.
+    rooted = np.empty(now.rows.shape)  # The numbers of a box are contiguous in memory, because the sums run over boxes.
     np.multiply(now.rows, np.sqrt(weight * now.use)[..., None], out=rooted)
     sums = sums_of_products(body, rooted[..., :PARAMETERS], rooted, len(values))
     information = sums[:, :, :PARAMETERS] + prior.information
@@ -185,7 +196,10 @@ def _normal(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Fl
 
 
 def sums_of_products(body: Ints, one: Floats, other: Floats, count: int) -> Floats:
-    """Return the sums (N, D, E) over the boxes of each body of one^T other, for one (B, R, D) and other (B, R, E)."""
+    """Return the sums (N, D, E) of the products one^T other over the boxes of each body. one: (B, R, D). other: (B, R, E).
+
+    body: (B,) the body of each box. count: the number N of bodies.
+    """
     if len(body) < _MANY * count or (np.diff(body) < 0).any():
         return grouped(body, np.swapaxes(one, 1, 2) @ other, count)
     ends = (one.shape[1] * np.searchsorted(body, np.arange(count + 1))).tolist()
@@ -199,9 +213,9 @@ def sums_of_products(body: Ints, one: Floats, other: Floats, count: int) -> Floa
 def _cost(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> Floats:
     """Return the cost (N,) of each body: half the weighted sum of squares of its residuals and of its prior.
 
-    weight: (B, 5), fixed during a step, also its robust part. now: the residuals at `values`. An edge that is a bound counts
-    only while the body does not reach it, and `now.use` says this for `values`. So the cost of a step shows at once that the
-    body has crossed a bound, and the steps do not jump back and forth across it.
+    weight: (B, 5), kept fixed during a step, with its robust part. now: the residuals at `values`. An edge that is a bound
+    counts only while the body does not reach beyond it. `now.use` says this for `values`. So the cost of a step shows at
+    once that the body has crossed a bound, and the steps do not jump back and forth across the bound.
     """
     off = values - prior.mean
     own = np.bincount(body, (weight * now.use * now.value**2).sum(axis=1), len(values))

@@ -1,8 +1,8 @@
-"""Edges of boxes beyond which something hides a part of the object.
+"""Find the edges of boxes beyond which something hides a part of the object. They are called hidden edges.
 
-A box goes around the visible part of an object, which is never larger than the object. So if something hides a part, the box
-ends short of the body. An edge that ends short by more than the noise may be hidden. Then it is a bound, as at the image's
-border. An edge that reaches too far does not count as hidden.
+A box goes around the visible part of an object. So if something hides a part, the box ends short of the body. An edge that
+ends short by more than the noise may be hidden. A hidden edge is a bound, like an edge at the image's border. An edge that
+reaches too far does not count as hidden.
 """
 
 from __future__ import annotations
@@ -22,28 +22,33 @@ from objslam.triangulation.bodies.shapes import CUBOID, KINDS, Kind
 from objslam.triangulation.bodies.shared import BEYOND, sides_of, spread_of, weights_of
 
 _OUTER = 0.05
-"""The outer body may reach beyond an edge. Then the edge counts with this share of its usual weight. With a smaller share,
-the outer body grows around the noise of more edges. With a larger share, hidden edges make the outer body too small."""
+"""The share of its usual weight with which an edge counts if the outer body (see `hidden_edges`) reaches beyond it. With a
+smaller share, the outer body grows around the noise of more edges. With a larger share, hidden edges make the outer body too
+small."""
 _CLEAR = 2.0
-"""An edge may be hidden if the body reaches beyond it by this number of standard deviations. The evidence decides whether it
-is hidden. With a larger number, bodies still bend to some hidden edges. With a smaller number, noise makes more visible
-edges count as hidden."""
+"""The number of standard deviations by which a body must reach beyond an edge that may be hidden. The evidence decides
+whether the edge is hidden. With a larger number, bodies still bend to some hidden edges. With a smaller number, noise makes
+more visible edges count as hidden."""
 _UNSEEN = 0.5
-"""An end of a body is unseen if the body just reaches more than this share of the bounds there. A bound lies inside a body
-whose end is known from other edges. With a larger share, fewer ends are unseen."""
+"""The share of the bounds at an end of a body above which the end is unseen, if the body just reaches them. If other edges
+show the end, the bounds lie inside the body. With a larger share, fewer ends are unseen."""
 _FEW_BOUNDS = 0.4
-"""At an unseen end, at least this share of the boxes have bounds. Other boxes may show the end, and then things that only
-touch in the image have bounds too. With 0.2, large things whose depths show the scale of a map lost 16 % of the exactness of
-this scale. With 0.5, 5 more of 38 desks behind chairs were outside their 95 % ellipsoid. With a larger share, fewer ends are
-unseen."""
+"""The least share of a body's boxes that have bounds at an unseen end. With fewer bounds, other boxes may show the end:
+things that only touch in the image have bounds too. With 0.2, large things whose depths show the scale of a map lost 16 % of
+the exactness of this scale. With 0.5, 5 more of 38 desks behind chairs were outside their 95 % ellipsoid. With a larger
+share, fewer ends are unseen."""
 _TURNS = 5
-"""How often hidden edges and the body without them are found in turns. Two to four are usual. More are slower."""
+"""The most turns of finding the hidden edges and fitting the body without them. Two to four turns are usual. More turns are
+slower."""
 
 
 @dataclass(frozen=True)
 class Hidden:
-    """The hidden edges of N bodies. edges: (B, 4) which are hidden. between: (N, 6, 6) how uncertain centre and half axes
-    (m) are because it is unknown whether edges are hidden. It is their second moment about the likelier body."""
+    """The hidden edges of N bodies.
+
+    edges: (B, 4) a mask of the hidden edges. between: (N, 6, 6) m^2, the uncertainty of centre and half axes because it is
+    unknown whether edges are hidden. It is the second moment of centre and half axes about those of the likelier body.
+    """
 
     edges: Bools
     between: Floats
@@ -51,8 +56,10 @@ class Hidden:
 
 @dataclass(frozen=True)
 class Noise:
-    """The noise of B boxes. factors, share: as in `Bodies`. number: (B, 4) as in `Sides`. side: (B,) px as in
-    `log_evidence`."""
+    """The noise of B boxes.
+
+    factors, share: as in `Bodies`. number: (B, 4) as in `Sides`. side: (B,) px, as in `log_evidence`.
+    """
 
     factors: Floats
     share: Floats
@@ -72,15 +79,16 @@ def with_hidden(edges: BoxEdges, hidden: Bools) -> BoxEdges:
 def hidden_edges(
     edges: BoxEdges, some: Ints, start: Floats, shape: Ints, prior: Prior, side: Floats, factors: Floats, share: Floats
 ) -> Hidden:
-    """Return the hidden edges. An object has some only if they explain its boxes better than a body that bends to fit all
-    edges.
+    """Return the hidden edges. An object has hidden edges only if they explain its boxes better than a body that bends to
+    fit all edges.
 
-    The first body bends to fit hidden edges too, and then none stands out. So an outer body is fitted, which reaches beyond
-    edges at little cost. Edges far inside it are taken to be hidden, and a body is fitted without them, in turns. It
-    competes with the body of all edges by the evidence. Before the fits, both are equally probable.
+    A body that is fitted to all edges bends to the hidden ones, so that no edge stands out. So an outer body is fitted,
+    which may reach beyond edges at little cost. Edges far inside this body are taken to be hidden, and a body is fitted
+    without them. These two steps repeat in turns. The evidence decides between the result and the body of all edges. Before
+    the fits, both are equally probable.
 
-    some: indices of the boxes that the fits use. start, shape: (N, 7) and (N,), bodies and their shapes. prior: of
-    ellipsoids. side: (B,) px as in `log_evidence`. factors, share: as in `Bodies`.
+    some: the indices of the boxes that the fits use. start: (N, 7) the bodies. shape: (N,) their shapes. prior: the prior of
+    ellipsoids. side: (B,) px, as in `log_evidence`. factors, share: as in `Bodies`.
     """
     found = Hidden(np.zeros((len(edges), 4), dtype=bool), np.zeros((len(start), 6, 6)))
     chosen = np.zeros(len(edges), dtype=bool)
@@ -101,12 +109,12 @@ def hidden_edges(
 
 
 def unseen_ends(edges: BoxEdges, values: Floats, shape: Ints, factors: Floats, share: Floats) -> Floats:
-    """Return how uncertain centre and half axes (N, 6, 6), m, are because no box shows where bodies (N, 7) end.
+    """Return the uncertainty (N, 6, 6), m^2, of centres and half axes because no box shows where bodies (N, 7) end.
 
-    If a thing in front hides one end of a thing from all sides that were seen, the body ends where its visible part does.
-    Then the edges there are bounds that the body just reaches. Edges of other boxes at the same end may be hidden by
-    something without a box, so they prove nothing. The end may be farther out by the hidden length (`BEYOND`), and then half
-    of it moves the centre. shape: (N,). factors, share: as in `Bodies`.
+    If a thing in front hides one end of a thing in all views, the body ends where its visible part ends. The edges there are
+    bounds that the body just reaches. Edges of other boxes at the same end prove nothing, because something without a box
+    may hide them. The end may be farther out by the hidden length (`BEYOND`). Half of this length moves the centre. shape:
+    (N,). factors, share: as in `Bodies`.
     """
     found = np.zeros((len(values), 6, 6))
     number = np.maximum(np.bincount(edges.body, minlength=len(values)), 1)
@@ -132,10 +140,11 @@ def unseen_ends(edges: BoxEdges, values: Floats, shape: Ints, factors: Floats, s
 
 
 def _moved(outward: Floats, yaw: Floats, *, upright: bool) -> Iterator[Floats]:
-    """Yield how centres and half axes (N, 6) of bodies change if a hidden end goes on by 2 m.
+    """Yield the changes (N, 6) of centres and half axes of bodies if a hidden end lies 2 m farther out.
 
-    Beyond the top or the bottom, it goes on upwards or downwards. Beyond a side, it goes on outwards, or aside of it, where
-    the thing in front hides it too. outward: (N, 3) normals of the bounds. yaw: (N,) rad, of the bodies.
+    A hidden top or bottom lies farther up or down. A hidden side lies farther outwards, or the body is moved at right angles
+    to that, where the thing in front also hides it. outward: (N, 3) the normals of the bounds. yaw: (N,) rad, the yaw of the
+    bodies. upright: whether the end is a top or a bottom.
     """
     none = np.zeros(len(yaw))
     if upright:
@@ -148,7 +157,7 @@ def _moved(outward: Floats, yaw: Floats, *, upright: bool) -> Iterator[Floats]:
 
 
 def _of_kind(edges: BoxEdges, some: Ints, start: Floats, kind: Kind, prior: Prior, noise: Noise) -> Hidden:
-    """Return the hidden edges of bodies of one kind (see `hidden_edges`). noise: of the boxes `some`."""
+    """Return the hidden edges of bodies of one kind (see `hidden_edges`). noise: the noise of the boxes `some`."""
     found = Hidden(np.zeros((len(edges), 4), dtype=bool), np.zeros((len(start), 6, 6)))
     few = edges.take(some)
     bent, before = _fitted(few, start, kind, prior, noise)
@@ -184,7 +193,7 @@ def _of_kind(edges: BoxEdges, some: Ints, start: Floats, kind: Kind, prior: Prio
 
 
 def _of_bodies(edges: BoxEdges, boxes: Ints, bodies: Ints) -> BoxEdges:
-    """Return some boxes, with the numbers of their bodies among the given ones."""
+    """Return some boxes. The body of each box is replaced by its index among the given bodies (sorted numbers)."""
     own = edges.take(boxes)
     return replace(own, body=np.searchsorted(bodies, own.body))
 
@@ -197,7 +206,7 @@ def _fitted(edges: BoxEdges, start: Floats, kind: Kind, prior: Prior, noise: Noi
 
 
 def _inside(edges: BoxEdges, values: Floats, kind: Kind, noise: Noise) -> Bools:
-    """Return which edges (B, 4) lie clearly inside bodies (N, 7) of one kind."""
+    """Return a mask (B, 4) of the edges that lie clearly inside bodies (N, 7) of one kind."""
     bare = replace(edges, bound=np.ones_like(edges.bound))  # Then the residuals are those of the edges.
     return np.asarray(beyond_edges(edges, values, kind) > _CLEAR * spread_of(bare, noise.factors, noise.share)[:, :4])
 

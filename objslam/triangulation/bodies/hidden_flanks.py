@@ -1,8 +1,8 @@
-"""Flanks of things in a row that their neighbours, or something between them, may hide.
+"""Find things in a row whose flanks may be hidden by their neighbours, or by something between them.
 
 The camera passes a row of things, such as pallets on a rack, and sees their fronts at many angles. If the neighbours or the
-uprights of the rack hide the flanks from all of them, the boxes go around the fronts only. The body of such boxes is flat,
-as that of a door would be, and nothing else tells the two apart.
+uprights of the rack hide the flanks at all angles, the boxes go around the fronts only. The body of such boxes is as flat as
+the body of a door. Nothing else tells such a thing from a door.
 """
 
 from __future__ import annotations
@@ -15,27 +15,28 @@ from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import grouped
 
 _PROBABILITY = 0.5
-"""The probability that a flat body in a row has hidden flanks. Boxes say nothing about it, so both are equally probable. A
-larger value makes the centres of flat things in rows less sure."""
+"""The probability that a flat body in a row has hidden flanks. It is 1/2, because boxes say nothing about hidden flanks. A
+larger probability makes the centres of flat things in rows less sure."""
 _FLAT = 0.5
-"""A body is flat if its depth is less than this share of its width. Bodies of simulated fronts had up to 0.45, and things
-that showed their flanks seldom less than 0.6. With a larger share, more bodies are flat."""
+"""The ratio of depth to width below which a body is flat. In simulations, bodies of fronts had ratios up to 0.45, and things
+that showed their flanks seldom had less than 0.6. With a larger ratio, more bodies are flat."""
 _BACK = np.sin(np.radians(20.0))
-"""A box shows the back of a body if its camera is farther behind the front than this sine says. At smaller angles, the back
-hardly shows, and the yaw of a flat body may err by as much. With a larger sine, more bodies are tried."""
+"""The sine of the least angle behind the plane of a body at which a camera sees the back of the body. At smaller angles, the
+back hardly shows, and the yaw of a flat body may err by as much. With a larger sine, more bodies count as seen from the
+front only."""
 _FROM_BEHIND = 0.05
-"""The most boxes that show the back of a body that was seen from its front only, as a share. A wrong box may be among many.
-With a larger share, more bodies are tried."""
+"""The largest share of boxes that may show the back of a body that counts as seen from the front only. Some boxes may be
+wrong. With a larger share, more bodies count as seen from the front only."""
 _NEIGHBOURS = 16
-"""The number of nearest bodies among which the neighbours of a body are sought. A rack has other things above and below. A
-larger number is slower."""
+"""The number of nearest bodies among which the neighbours of a body are sought. It is more than two, because a rack has
+other things above and below. A larger number is slower."""
 
 
 def hidden_flanks(edges: BoxEdges, axes: Floats) -> Floats:
-    """Return how uncertain centre and half axes (N, 6, 6), m, are because the flanks of flat bodies in rows may be hidden.
+    """Return the uncertainty (N, 6, 6), m^2, of centres and half axes because flanks of flat bodies in rows may be hidden.
 
-    Boxes show a flat body from its front only, and a neighbour stands next to it. Then the body may go on behind its front,
-    until it is as deep as it is wide, as the weak prior of bodies says. The matrix is 0 for all other bodies.
+    If boxes show a flat body from its front only, and a neighbour stands next to it, the body may go on behind its front. It
+    may be as deep as it is wide, as the weak prior of bodies says. The matrix is 0 for all other bodies.
 
     axes: (N, 7) centre, m, half axes, m, and yaw, rad, as in `Bodies.axes`.
     """
@@ -55,11 +56,11 @@ def hidden_flanks(edges: BoxEdges, axes: Floats) -> Floats:
 
 
 def _in_row(axes: Floats, along: Floats, width: Floats, depth: Floats) -> Bools:
-    """Return whether another body stands next to each body (N,), to its right or to its left.
+    """Return a mask (N,) of the bodies that have another body next to them, to the right or to the left.
 
-    It stands there if the gap is smaller than the depth that may be hidden. Through such a gap, no flank is seen from more
-    than 45 degrees beside the front. axes: as in `hidden_flanks`. along: (N, 2) unit, along the width. width, depth: (N,)
-    half axes, m.
+    A body stands next to another one if the gap is smaller than the depth that may be hidden. Through such a gap, no camera
+    sees a flank from more than 45 degrees beside the front. axes: as in `hidden_flanks`. along: (N, 2) unit, along the
+    width. width, depth: (N,) half axes, m.
     """
     count = min(_NEIGHBOURS + 1, len(axes))
     if count < 2:

@@ -1,4 +1,4 @@
-"""The priors of bodies: from the apparent size of each object, from other objects of its label, and from known sizes."""
+"""Make priors of bodies from the apparent size of each object, from other objects of its label, and from known sizes."""
 
 from __future__ import annotations
 
@@ -12,30 +12,32 @@ from objslam.triangulation.bodies.fit import Prior
 from objslam.triangulation.bodies.shapes import PARAMETERS
 
 _POSITION = 20.0
-"""The standard deviation (m) of a centre around the triangulated point. With a larger value, boxes decide more."""
+"""The standard deviation (m) of a centre around the triangulated point. With a larger value, boxes decide more about the
+centre."""
 _SIZE = 0.7
-"""The standard deviation of the logarithm of a half axis around its apparent value. 0.7 is a factor of 2. With a larger
-value, an object that is seen from one side may become very deep or flat."""
+"""The standard deviation of the logarithm of a half axis around the logarithm of its apparent value. 0.7 is a factor of 2.
+With a larger value, an object that is seen from one side may become very deep or flat."""
 _ASPECT = 0.35
-"""The standard deviation of the two aspect parameters q and s. The median ratio of the horizontal half axes is then 2.3. A
-larger value allows longer objects."""
+"""The standard deviation of the two aspect parameters q and s of ellipsoids. With 0.35, the median ratio of the horizontal
+half axes is 2.3. A larger value allows longer objects."""
 _DOT = 1e-4
 """The half axes (m) of an ellipsoid that represents a point, far below the size of any object."""
 _LIKE = 2.0
-"""With this many bodies of a label, the spread of their sizes weighs as much as _SIZE and _ASPECT. A larger number trusts
-the label less."""
+"""The number of bodies of a label from which the spread of their sizes weighs as much as `_SIZE` and `_ASPECT`. A larger
+number trusts the label less."""
 _LEAST = 0.1
-"""The least standard deviation of the logarithm of a half axis, in the prior of a label. A smaller value trusts the label
-more."""
+"""The least standard deviation of the logarithm of a half axis in the prior of a label. A known size has the same one. A
+larger value trusts the label less."""
 _UNTOLD = 1e-3
-"""The least reliability of a size, as a share. It keeps sizes finite that boxes do not show. Such sizes have no weight."""
+"""The least reliability of a size, as a share. It prevents a division by zero for sizes that boxes do not show. Such sizes
+have next to no weight. A larger share gives them more weight."""
 _TIE = 1e-3
-"""The half axes of a sphere are equal. So the differences of their logarithms have this standard deviation, which is
-practically 0. A larger value allows flatter spheres."""
+"""The standard deviation of the differences between the logarithms of a sphere's half axes. It is practically 0, because the
+half axes of a sphere are equal. A larger value allows flatter spheres."""
 
 
 def weak_prior(points: Floats, half: Floats) -> Prior:
-    """Return the prior of bodies at points (N, 3), m, with the apparent half axes (N, 2) across and upwards, m."""
+    """Return the prior of ellipsoids at points (N, 3), m, with the apparent half axes (N, 2), m, across and upwards."""
     count, log = len(points), np.log(half)
     mean = np.column_stack([points, log[:, 0], np.zeros((count, 2)), log[:, 1]])
     sigma = np.array([*[_POSITION] * 3, _SIZE, _ASPECT, _ASPECT, _SIZE])
@@ -45,14 +47,14 @@ def weak_prior(points: Floats, half: Floats) -> Prior:
 def label_prior(weak: Prior, fitted: Prior, values: Floats, covariance: Floats, label: Ints, cuboid: Bools) -> Prior:
     """Return the prior that the bodies of each label have in common (empirical Bayes; Efron and Morris 1973).
 
-    Boxes from one side leave a half axis open, and then it is as large as the prior of its fit says. Such a value is no
-    measurement. So each value counts with its reliability: the share of its information that comes from boxes. If the
-    plates of a label, such as doors, were all seen at an angle, their boxes do not show that they are plates. Without the
-    reliability, they would all be counted as round.
+    Boxes from one side leave a half axis open. This half axis gets the value that the prior of its fit says, and such a
+    value is no measurement. So each value counts with its reliability: the share of its information that comes from boxes.
+    An example is a label of flat things, such as doors, that were all seen at an angle. Their boxes do not show that they
+    are flat. Without the reliability, all would count as round.
 
-    fitted: the prior of the fit, of ellipsoids. values, covariance: (N, 7), (N, 7, 7) of the fitted bodies. label: (N,).
-    cuboid: (N,) which bodies are cuboids. The result is for ellipsoids. A label with one body, and the label -1, keep the
-    prior `weak`.
+    The result is for ellipsoids. A label with one body, and the label -1, keep the prior `weak`. fitted: the prior of the
+    fit, for ellipsoids. values, covariance: (N, 7) and (N, 7, 7), the fitted bodies. label: (N,). cuboid: (N,) a mask of the
+    bodies that are cuboids.
     """
     mean, variance = weak.mean.copy(), 1 / np.einsum("nii->ni", weak.information).copy()
     spread = np.einsum("nii->ni", covariance)
@@ -89,9 +91,10 @@ def label_prior(weak: Prior, fitted: Prior, values: Floats, covariance: Floats, 
 def known_sizes(
     prior: Prior, values: Floats, names: tuple[str, ...], sizes: Mapping[str, tuple[float, float, float]]
 ) -> Prior:
-    """Return the prior with known sizes (length, width, height), m, of labels. names: the label of each body.
+    """Return the prior of ellipsoids with known sizes of labels.
 
     The yaw of a body stays free. Only its aspect is drawn towards the known aspect, at the yaw that the fit has found.
+    values: (N, 7) the fitted ellipsoids. names: the label of each body. sizes: length, width and height, m, by label.
     """
     mean, information = prior.mean.copy(), prior.information.copy()
     for body, name in enumerate(names):
@@ -108,14 +111,14 @@ def known_sizes(
 
 
 def sphere_prior(prior: Prior) -> Prior:
-    """Return the prior of spheres: its three half axes are equal."""
+    """Return the prior of spheres. It keeps the three half axes of a body equal."""
     information = prior.information.copy()
     information[:, [4, 5], [4, 5]] += _TIE**-2
     tie = np.zeros(PARAMETERS)
     tie[[3, 6]] = 1.0, -1.0
     mean = prior.mean.copy()
     mean[:, 4:6] = 0.0
-    # The tie makes the horizontal and the upward half axis equal. Their mean comes from the two own priors.
+    # The tie makes the horizontal and the upward half axis equal. The mean of both follows from their two priors.
     precision = information[:, [3, 6], [3, 6]]
     common = (precision * mean[:, [3, 6]]).sum(axis=1) / precision.sum(axis=1)
     mean[:, 3] = mean[:, 6] = common
@@ -123,7 +126,10 @@ def sphere_prior(prior: Prior) -> Prior:
 
 
 def cuboid_prior(prior: Prior, start: Floats) -> Prior:
-    """Return the prior of cuboids with the sizes and aspects of a prior of ellipsoids. start: (N, 7) gives the mean yaws."""
+    """Return the prior of cuboids with the sizes and aspects of a prior of ellipsoids.
+
+    start: (N, 7) cuboids whose yaws are the means of the prior.
+    """
     mean, information = prior.mean.copy(), prior.information.copy()
     towards = np.stack([np.cos(2 * start[:, 5]), np.sin(2 * start[:, 5])], axis=1)
     mean[:, 4], mean[:, 5] = (prior.mean[:, 4:6] * towards).sum(axis=1), start[:, 5]
@@ -141,5 +147,5 @@ def dot_prior(prior: Prior) -> Prior:
 
 
 def apparent_half_axes(width: Floats, height: Floats) -> Floats:
-    """Return the apparent half axes (N, 2), m, across and upwards, from medians (N,) of the width and the height, m."""
+    """Return the apparent half axes (N, 2), m, across and upwards, from apparent widths (N,) and heights (N,), m."""
     return np.maximum(np.column_stack([width, height]) / 2, 1e-3)

@@ -1,9 +1,9 @@
-"""The residuals of boxes against bodies, and their derivatives.
+"""Compute the residuals of boxes against bodies, and the derivatives of the residuals.
 
-Let a plane go through the camera m, with the outward unit normal n. Let a body have the centre c and the support h(n). The
-plane touches the body if n . (c - m) + h(n) = 0. For an ellipsoid with the matrix M, h = sqrt(n^T M n), and this is the
-equation of its dual quadric (Hartley and Zisserman 2004, section 8.3). If the left side is not 0, it is the length, m, by
-which the body reaches beyond the plane. Divided by the distance of the touched point, it is an angle.
+Let a plane go through the camera centre m, with the outward unit normal n. Let a body have the centre c and the support
+h(n). The plane touches the body if n . (c - m) + h(n) = 0. For an ellipsoid with the matrix M, h = sqrt(n^T M n), and this
+is the equation of its dual quadric (Hartley and Zisserman 2004, section 8.3). If the left side is not 0, it is the length,
+m, by which the body reaches beyond the plane. Divided by the distance of the touched point, it is an angle.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from objslam.triangulation.bodies.edges import BoxEdges, by_columns
 from objslam.triangulation.bodies.shapes import PARAMETERS, Kind, rows_of_kinds
 
 ROWS = 5
-"""The residuals of a box: its shift in two axes and half its size in two axes, px, and its range, m."""
+"""The number of residuals of a box: two of its shift and two of half its size, px, and one of its range, m."""
 _LEAST = 1e-9
 """The least length (m) of a divisor. A larger length distorts small bodies."""
 _ALONG = np.linspace(0.125, 1.0, 8)[:, None]
-"""The places of the points that are tried on a straight side of a body, as shares of its length. More points find more
-exactly where a box touches the side in a distorted image. With these 8 points, the error is below 0.1 px for a side that is
-60 degrees long."""
+"""The places of the points that are tried on a straight side of a body, as shares of the length of the side. With more
+points, the place where a box touches the side in a distorted image is more exact. With 8 points, the error is below 0.1 px
+for a side that is 60 degrees long."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,10 @@ class Residuals:
     """The residuals of B boxes.
 
     value: (B, 5), predicted minus measured: the shift in x and y (px), half of the width and of the height (px), and the
-    range (m). If an edge of an axis is a bound, the two edges of this axis replace its shift and its size. by: (B, 5, 7)
-    derivatives of `value` by the parameters of the bodies. rows: (B, 5, 8) the derivatives, then the value. use: (B, 5)
-    whether a residual counts. An edge that is a bound counts only while the body does not reach it.
+    range (m). If an edge of an axis is a bound, the residuals of the two edges of this axis replace its shift and its size.
+    by: (B, 5, 7) the derivatives of `value` by the parameters of the bodies. rows: (B, 5, 8) the derivatives, followed by
+    the value. use: (B, 5) whether a residual counts, 0 to 1. An edge that is a bound counts only while the body does not
+    reach beyond it. A range counts only if its ray hits the body.
     """
 
     rows: Floats
@@ -57,15 +58,20 @@ class Residuals:
 
 
 def edge_gaps(edges: BoxEdges, values: Floats, kind: Kind) -> tuple[Floats, Floats, Floats]:
-    """Return the gaps (B, 4), m, by which bodies (N, 7) reach beyond their planes, the derivatives (B, 4, 7), and the points
-    (B, 4, 3) in map at which the bodies come closest to the planes."""
+    """Return the gaps (B, 4), m, by which bodies (N, 7) reach beyond the planes of edges.
+
+    Also return the derivatives (B, 4, 7) of the gaps by the parameters, and the points (B, 4, 3), m, in map at which the
+    bodies come closest to the planes.
+    """
     gap, by_shape, points = _gaps(edges, values, kind)
     return gap, np.concatenate([edges.normal, by_shape], axis=2), points
 
 
 def _gaps(edges: BoxEdges, values: Floats, kind: Kind) -> tuple[Floats, Floats, Floats]:
-    """Return the same as `edge_gaps`, but the derivatives (B, 4, 4) by the last four parameters only. Those by the centre
-    are the normals."""
+    """Return the same as `edge_gaps`, but only the derivatives (B, 4, 4) by the last four parameters.
+
+    The derivatives by the centre are the normals.
+    """
     centre = by_columns(values[:, :3], edges.body)
     reach, by_shape, points = kind.support(values, edges.body, edges.normal)
     points += centre[:, None]
@@ -104,7 +110,7 @@ def beyond_edges(edges: BoxEdges, values: Floats, kind: Kind) -> Floats:
 
 
 def _scale(edges: BoxEdges, points: Floats) -> Floats:
-    """Return the length (B, 4), m, that one pixel has at points (B, 4, 3) of the bodies."""
+    """Return the length (B, 4), m, of one pixel at the distance of points (B, 4, 3), m, of the bodies."""
     away = points - edges.origin[:, None]
     return np.maximum(np.sqrt(_products(away, away)) * edges.turn, _LEAST)
 
@@ -124,9 +130,9 @@ def residuals_of_shapes(edges: BoxEdges, values: Floats, shape: Ints) -> Residua
 
 
 def touched_points(edges: BoxEdges, values: Floats, shape: Ints) -> Floats:
-    """Return points (B, 4, P, 3) in map at which the edges may touch bodies (N, 7) with shapes (N,).
+    """Return points (B, 4, P, 3), m, in map at which the edges may touch bodies (N, 7) with shapes (N,).
 
-    The first is the point that comes closest to the plane. The others lie on the straight sides of the body that end there.
+    The first is the point of the body closest to the plane. The others lie on the straight sides that end at this point.
     """
     points = np.empty((len(edges), 4, 1 + 3 * len(_ALONG), 3))
     for kind, boxes in rows_of_kinds(shape[edges.body]):
@@ -140,7 +146,7 @@ def touched_points(edges: BoxEdges, values: Floats, shape: Ints) -> Floats:
 
 
 def nominal_noise(edges: BoxEdges) -> Floats:
-    """Return the noise (B, 5) of shift, size and range by the settings, before it is estimated from the log."""
+    """Return the standard deviations (B, 5) of shift (px), half size (px) and range (m), as the settings say."""
     edge = edges.sigma / np.sqrt(2)
     sigma = np.empty((len(edge), ROWS))
     sigma[:, :2], sigma[:, 2:4] = np.hypot(edge, edges.shift)[:, None], edge[:, None]
@@ -151,8 +157,8 @@ def nominal_noise(edges: BoxEdges) -> Floats:
 def at_edges(edges: BoxEdges, noise: Floats) -> Floats:
     """Return the noise (B, 5) of the residuals, given the noise (B, 5) of shift, size and range.
 
-    If an edge of an axis is a bound, the residuals of this axis are its two edges. An edge has the noise of shift and size
-    together.
+    If an edge of an axis is a bound, the residuals of this axis are those of its two edges. The noise of an edge is the root
+    of the summed squares of the noise of shift and of size.
     """
     row, axis = _axes_with_bound(edges)
     both = np.hypot(noise[row, axis], noise[row, axis + 2])
@@ -162,10 +168,10 @@ def at_edges(edges: BoxEdges, noise: Floats) -> Floats:
 
 
 def on_shift_and_size(edges: BoxEdges, rows: Floats) -> Floats:
-    """Return derivatives (B, 5, ...) by shift, size and range, from derivatives by the residuals.
+    """Return derivatives (B, 5, ...) by shift, size and range, from derivatives `rows` (B, 5, ...) by the residuals.
 
-    If an edge of an axis is a bound, the residuals of this axis are its two edges. A shift changes the residuals of the two
-    edges with opposite signs, a size with the same sign.
+    If an edge of an axis is a bound, the residuals of this axis are those of its two edges. A shift changes these two
+    residuals with opposite signs. A size changes both with the same sign.
     """
     row, axis = _axes_with_bound(edges)
     low, high = rows[row, axis], rows[row, axis + 2]
@@ -175,7 +181,8 @@ def on_shift_and_size(edges: BoxEdges, rows: Floats) -> Floats:
 
 
 def whole_axes(edges: BoxEdges) -> Bools:
-    """Return which of the residuals (B, 4) of boxes are shifts and sizes: an axis has them if it has no bound."""
+    """Return a mask (B, 4) of the residuals of boxes that are shifts and sizes. These are the residuals of axes without a
+    bound."""
     return np.tile((edges.bound[:, :2] == 0) & (edges.bound[:, 2:] == 0), 2)
 
 

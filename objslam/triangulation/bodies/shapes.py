@@ -1,8 +1,7 @@
 """The kinds of bodies: upright ellipsoids, cuboids and cylinders, with the same functions for all.
 
-All have seven parameters: the centre x, y, z (m), a number p and two numbers of the horizontal section, and the logarithm k
-of the half axis upwards. p is the mean logarithm of the horizontal half axes. `support` returns how far tangent planes are
-from the centre, `ranges` how far the surface is along rays.
+All kinds have seven parameters. These are the centre x, y, z (m), three numbers of the horizontal section, and the logarithm
+k of the half axis upwards (m). The first number of the section, p, is the mean logarithm of the horizontal half axes (m).
 """
 
 from __future__ import annotations
@@ -22,17 +21,22 @@ PARAMETERS = 7
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of bodies.
+    """The functions of one kind of bodies.
 
-    support: takes parameters (N, 7), the body (B,) of each box, and unit normals (B, 4, 3). Returns the distances (B, 4), m,
-    of tangent planes from the centre, their derivatives (B, 4, 4) by the last four parameters, and the points (B, 4, 3), m,
-    that they touch, relative to the centre.
-    sides: takes parameters (B, 1, 7) and those points. Returns vectors (B, 4, S, 3), m, along the straight sides of the body
-    that end there, to their other ends. In a distorted image, a box may touch a side in its middle.
-    ranges: takes parameters (B, 7), origins (B, 3), m, and directions (B, 3) of rays. Returns the distances (B,), m, to the
-    surface, their derivatives (B, 7), and which rays (B,) hit it. The other functions take parameters (N, 7). half_axes:
-    returns the half axes (N, 3), m, the long horizontal one first. heading: the yaw (N,), rad, of the long axis.
-    axes_jacobian: the derivatives (N, 7, 7) of centre, half axes and yaw by the parameters.
+    support: takes parameters (N, 7), the body (B,) of each box, and unit normals (B, 4, 3). It returns the distances (B, 4),
+    m, of tangent planes from the centre, the derivatives (B, 4, 4) of the distances by the last four parameters, and the
+    touched points (B, 4, 3), m, relative to the centre.
+
+    sides: takes parameters (B, 1, 7) and the touched points. It returns vectors (B, 4, S, 3), m, from each touched point
+    along the S straight sides that end at this point, to their other ends. In a distorted image, a box may touch a side in
+    its middle.
+
+    ranges: takes parameters (B, 7), origins (B, 3), m, and unit directions (B, 3) of rays. It returns the distances (B,), m,
+    to the surface, their derivatives (B, 7), and a mask (B,) of the rays that hit the surface.
+
+    half_axes: takes parameters (N, 7), and returns the half axes (N, 3), m, the long horizontal one first. heading: takes
+    parameters (N, 7), and returns the yaw (N,), rad, of the long horizontal axis. axes_jacobian: takes parameters (N, 7),
+    and returns the derivatives (N, 7, 7) of centre, half axes and yaw.
     """
 
     support: Callable[[Floats, Ints, Floats], tuple[Floats, Floats, Floats]]

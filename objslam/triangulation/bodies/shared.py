@@ -1,6 +1,8 @@
-"""Errors that the boxes of a body share. A side is a direction from which an object is seen. All boxes from one side err
-alike, because the outline is no ellipse and detectors err systematically. Averaging does not help, so these boxes count as
-few (Kish 1965).
+"""Estimate the errors that the boxes of a body share, and weigh the boxes accordingly.
+
+A side of an object is a direction from which it is seen. All boxes from one side err alike, because the outline of the
+object is no ellipse, and because detectors err systematically. Averaging does not reduce this error, so the boxes of a side
+count as few (Kish 1965).
 """
 
 from __future__ import annotations
@@ -18,48 +20,52 @@ from objslam.triangulation.bodies.fit import Fit, Weights, grouped
 from objslam.triangulation.bodies.residuals import ROWS, Residuals, at_edges, nominal_noise, on_shift_and_size, whole_axes
 
 SIDES = 103
-"""The number of sides from which an object can be seen, evenly over the sphere, 20 degrees apart. All boxes from one side
-count as one measurement. A larger number is finer and slower."""
+"""The number of sides from which an object can be seen. They are spread evenly over the sphere, 20 degrees apart. The boxes
+from one side share an error. A larger number makes narrower sides, and is slower."""
 ALIKE = np.radians(20.0)
-"""The angle (rad) between two views of an object at which the errors of its boxes have the correlation 1/2. With a larger
-angle, views must differ more to average the errors out. A detector had 5 to 20 degrees on three objects of YCB-Video."""
+"""The angle (rad) between two views of an object over which the correlation of their shared errors falls to 1/2. With a
+larger angle, views must differ more to average the errors out. A detector had 5 to 20 degrees on three objects of
+YCB-Video."""
 WITHIN = 0.7
-"""The correlation between the errors of two boxes from one side, whose directions differ by 10 degrees on average. So the
-mean error of a side has this share of the variance of a single error. With a larger share, smaller errors are found."""
+"""The correlation between the shared errors of two boxes from one side. The directions of two such boxes differ by 10
+degrees on average. So the variance of the mean error of a side is this share of the variance of a single error. With a
+larger share, the estimate of the errors is smaller."""
 UNLIKE = 0.04
-"""No thing has exactly the shape of its body, so the boxes of one side share an error. This is its least standard deviation,
-as a share of half the size. The outlines of a hexagonal prism and of the best cylinder differ by 4 %. Things that were seen
-from one side do not show this error, because their bodies bend to it. A larger share makes their depths less sure."""
+"""The least standard deviation of the error that the boxes of one side share, as a share of half the size. Boxes share an
+error because no thing has exactly the shape of its body. The outlines of a hexagonal prism and of the best cylinder differ
+by 4 %. Things that were seen from one side do not show this error, because their bodies bend to it. A larger share makes
+their depths less sure."""
 _ALONG = 1.0
-"""The error of a side changes with the distance. This is the standard deviation of the change from a distance to e times
-this distance, in standard deviations of the error. With a larger change, the growth of boxes says less about the
-distance."""
+"""The standard deviation of the change in the error of a side if the distance grows by a factor of e, in standard deviations
+of the error. With a larger change, the growth of boxes says less about the distance."""
 BEYOND = 0.5
 """The root mean square of the hidden length beyond an edge that is a bound, as a share of the size of the box. Lengths that
-are evenly spread between 0 and 0.9 of the size have this value. A larger share makes objects that something hides less
+are evenly spread between 0 and 0.9 of the size have this root mean square. A larger share makes partly hidden objects less
 sure."""
 _SHARES = 41
-"""The number of values that `share_of` tries, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
+"""The number of shares that `share_of` tries, from 0 to `_WIDEST` times the prior. A larger number is more exact and slower.
+"""
 _WIDEST = 6.0
-"""The largest share that `share_of` tries, in standard deviations of its prior. A larger value admits worse outlines."""
+"""The largest share that `share_of` tries, as a multiple of the scale of its prior. A larger value admits worse outlines."""
 _UNLIKE_OTHERS = 0.01
-"""The prior chance that a body has another share than the others, because some of its boxes are of another thing. So one
-body counts no more than a chance of this size allows. Without it, ten wrong boxes at one of 45 doors made the share 0.3
-instead of 0.03, and then no door showed that it is flat. With a larger chance, a body counts less: with 0.1, the share of a
-few bodies is too small."""
+"""The prior chance that a body has another share than the other bodies, because some of its boxes show another thing. This
+limits how much one body counts. Without this chance, ten wrong boxes at one of 45 doors made the share 0.3 instead of 0.03,
+and then no door showed that it is flat. With a larger chance, each body counts less. With 0.1, the share from a few bodies
+is too small."""
 _AT_ONCE = 64
-"""`share_of` computes the likelihoods of at most this number of bodies at once. A larger number needs more memory."""
+"""The most bodies whose likelihoods `share_of` computes at once. A larger number needs more memory."""
 _NOMINAL = 20.0
-"""With this many residuals, their scatter weighs as much as the nominal noise of the settings. A larger number gives the
-nominal noise more weight."""
+"""The weight of the nominal noise of the settings against the scatter of the residuals, as half the number of residuals. A
+larger number gives the nominal noise more weight."""
 
 
 @dataclass(frozen=True)
 class Sides:
-    """The sides from which N bodies were seen. cell: (B,) the side of each box. owner: (C,) the body of each side.
+    """The C sides from which N bodies were seen in B boxes.
 
-    alike: for each body, the correlation (c, c) between the errors of its c sides. number: (B, 4) how many boxes share the
-    error of each shift and size, weighted by the correlation.
+    cell: (B,) the side of each box. owner: (C,) the body of each side. alike: for each body, the correlations (c, c) between
+    the errors of its c sides. number: (B, 4) the number of boxes that share the error of each shift and size, weighted by
+    the correlation.
     """
 
     cell: Ints
@@ -69,7 +75,8 @@ class Sides:
 
 
 def sides_of(edges: BoxEdges, centre: Floats, use: Floats | None = None) -> Sides:
-    """Return the sides of bodies with centres (N, 3) m in map. use: (B, 4) whether a residual counts, None if all do."""
+    """Return the sides of bodies with centres (N, 3), m, in map. use: (B, 4) whether a residual counts, None if all
+    count."""
     towards = centre[edges.body] - edges.origin
     towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     seen = edges.body * SIDES + (towards @ evenly_spread(SIDES).T).argmax(axis=1)
@@ -110,7 +117,7 @@ def some_of_each_side(sides: Sides, most: int) -> Ints:
 def white_factors(edges: BoxEdges, now: Residuals, sides: Sides, which: Bools) -> Floats:
     """Return the factors (2,) on the nominal noise of shifts and of sizes, from the scatter of boxes within a side.
 
-    which: (B,) the boxes that count.
+    now: the residuals of the boxes. which: (B,) a mask of the boxes that count.
     """
     whole, sigma = whole_axes(edges), nominal_noise(edges)
     number = np.stack([np.bincount(sides.cell, part) for part in whole.T], axis=1)
@@ -134,9 +141,9 @@ def spread_of(edges: BoxEdges, factors: Floats, share: Floats) -> Floats:
 
 
 def weights_of(edges: BoxEdges, number: Floats, factors: Floats, share: Floats) -> Weights:
-    """Return how much the residuals count. The variances are such that the shared error of a side counts once.
+    """Return how much the residuals count, so that the shared error of a side counts once.
 
-    number: (B, 4) as in `Sides`.
+    number: (B, 4) as in `Sides`. factors, share: (2,) as in `Bodies`.
     """
     ranged = np.bincount(edges.body, np.isfinite(edges.range))  # All ranges of a body share their error.
     number = np.column_stack([number, ranged[edges.body]])
@@ -158,10 +165,10 @@ def _scale(edges: BoxEdges, share: Floats) -> Floats:
 def share_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, prior: float, which: Bools) -> Floats:
     """Return the standard deviations (2,) of the errors that the boxes of one side share, as shares of half their size.
 
-    The first is of the shifts of boxes, the second of their sizes. Each is the root mean square of its posterior. Because
-    the bodies are unknown, the likelihood is the restricted one (Patterson and Thompson 1971). The prior is half-normal
-    (Gelman 2006), with the scale `prior`. A body may differ from the others (`_UNLIKE_OTHERS`). which: (N,) the bodies that
-    count.
+    The first share is that of the shifts of boxes, and the second that of their sizes. Each is the root mean square of its
+    posterior. Because the bodies are unknown, the likelihood is the restricted one (Patterson and Thompson 1971). The prior
+    is half-normal (Gelman 2006), with the scale `prior`. A body may differ from the others (`_UNLIKE_OTHERS`). which: (N,) a
+    mask of the bodies that count.
     """
     shares = np.linspace(0.0, _WIDEST * prior, _SHARES)
     likelihood = np.tile(-0.5 * (shares / prior) ** 2, (2, 1))
@@ -180,7 +187,7 @@ def share_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, prior: fl
     told = np.flatnonzero(which & (number > 1))
     for begin in range(0, len(told), _AT_ONCE):
         some = told[begin : begin + _AT_ONCE]
-        # Bodies with fewer sides get sides that measure nothing, so that all arrays have one shape.
+        # A body with fewer sides gets more sides that measure nothing, so that the arrays of all bodies have one shape.
         most = int(number[some].max())
         cell = bounds[some, None] + np.arange(most)
         real = np.arange(most) < number[some, None]
@@ -215,17 +222,18 @@ def share_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, prior: fl
 def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, share: Floats) -> Floats:
     """Return the covariances (N, 7, 7) of the parameters of bodies, with the errors that their boxes share.
 
-    An estimate that weighs residuals with W has the covariance A^-1 (J^T W V W J + P) A^-1, where A = J^T W J + P. V is the
-    true covariance of the residuals, and P is the information of the prior.
+    If W are the weights of the residuals, the covariance is A^-1 (J^T W V W J + P) A^-1, where A = J^T W J + P. J are the
+    derivatives of the residuals, V is their true covariance, and P is the information of the prior.
     """
     return covariance_with_unlike(edges, fit, sides, factors, share)[0]
 
 
 def covariance_with_unlike(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, share: Floats) -> tuple[Floats, Floats]:
-    """Return `covariance_of`, and what is added to it because no thing has exactly the shape of its body (`UNLIKE`).
+    """Return the covariances (N, 7, 7) of `covariance_of`, and covariances (N, 7, 7) to be added to them (`UNLIKE`).
 
-    The error of a side is not the same from all distances. If it were, the growth of boxes on the way to a thing would give
-    its distance exactly, however wrong its outline is.
+    The second ones allow for the fact that no thing has exactly the shape of its body. The error of a side is not the same
+    from all distances. If it were the same, the growth of boxes on the way to a thing would give the distance of the thing
+    exactly, however wrong its outline is.
     """
     count = len(fit.values)
     loose = np.zeros((len(edges), ROWS))
@@ -257,9 +265,9 @@ def covariance_with_unlike(edges: BoxEdges, fit: Fit, sides: Sides, factors: Flo
 def _weights_of_bounds(edges: BoxEdges, found: Residuals) -> Floats:
     """Return the weights (B, 4), 1/px^2, with which bounds count in a covariance, 0 for residuals that are no bounds.
 
-    A body that just reaches a bound may go on beyond it, by a length that nobody sees. So a bound counts like a measured
-    edge with an error of this length, which is at least `BEYOND`. All boxes of a body share this error, so they count as
-    one.
+    A body that just reaches a bound may go on beyond it, by a hidden length. So a bound counts like a measured edge whose
+    error has this length, at least `BEYOND` times the size of the box. All boxes of a body share this error, so together
+    they count as one.
     """
     length = np.hypot(BEYOND * np.maximum(edges.size, 1.0)[:, None], np.maximum(found.value[:, : ROWS - 1], 0.0))
     number = np.bincount(edges.body)[edges.body, None]

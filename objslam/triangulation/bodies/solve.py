@@ -1,4 +1,7 @@
-"""Find the bodies of all objects of a map: fit, learn the noise and the sizes of labels, and choose a shape for each."""
+"""Find the bodies of all objects of a map.
+
+Bodies of all shapes are fitted, the noise and the sizes of labels are learned, and a shape is chosen for each object.
+"""
 
 from __future__ import annotations
 
@@ -30,18 +33,22 @@ from objslam.triangulation.bodies.shared import (
 from objslam.triangulation.bodies.to_centre import directions_to_centres, shifts_of
 
 Measure = Callable[[Floats | None], BoxEdges]
-"""The edges of the boxes, given points (B, 4, P, 3) in map at which bodies may touch them. None means unknown points."""
+"""A function that returns the edges of boxes, given points (B, 4, P, 3), m, in map at which bodies may touch the edges.
+
+None means that the points are unknown."""
 More = Callable[["Bodies"], "BoxEdges | None"]
-"""More edges that can only be found with the bodies, such as the edges of cut off boxes. None if there are none."""
+"""A function that returns more edges, which can only be found with the bodies, such as the edges of boxes that are cut off.
+It returns None if it finds no more edges."""
 
 _POINT, _SPHERE, _ELLIPSOID, _CUBOID, _CYLINDER = range(5)
 _SOLID = (_ELLIPSOID, _CUBOID, _CYLINDER)
 """The shapes with three free half axes."""
 _ROUNDS = 2
-"""How often the noise is estimated from the residuals of the last fit. More rounds are slower and change little."""
+"""The number of rounds in which the noise is estimated from the residuals of the last fit. More rounds are slower and change
+little."""
 _PER_SIDE = 3
-"""Shape and noise are found from this number of boxes from each side. Boxes from one side repeat one error, so more boxes
-are slower and hardly help. The last fit uses all boxes."""
+"""The most boxes from each side of an object that are used to find shape and noise. Boxes from one side repeat one error, so
+more boxes are slower and hardly help. The last fit uses all boxes."""
 _RARE = 20.0
 """The prior odds against a sphere, because few things are balls. With larger odds, fewer bodies are spheres."""
 
@@ -50,15 +57,15 @@ _RARE = 20.0
 class Bodies:
     """The bodies of N objects.
 
-    values: (N, 7) parameters of the body's kind (see `shapes`). covariance: (N, 7, 7). shape: (N,) 0 point, 1 sphere, 2
-    ellipsoid, 3 cuboid, 4 cylinder. evidence: (5, N) the logarithm of the evidence of each shape, plus the logarithm of how
-    usual the shape is (`with_shares_of_shapes`). weight: (B,) the robust weight of each box. share: (2,) the standard
-    deviations of the errors of shift and size that boxes of one side share, as shares of half their size. factors: (2,) on
-    the nominal noise of shifts and sizes. to_centre: (B, 3) unit direction to the centre of each body, minus the unit
-    direction to the centre of its predicted box, in map. It is 0 for a point. hidden: (B, 2) the number of hidden edges on
-    each axis, as in `hidden_edges`. between_shapes: (N, 6, 6) the second moment of centre and half axes, m, over the shapes,
-    about the chosen one. It is not in `covariance`. unlike: (N, 7, 7) what is added to `covariance` because no thing has
-    exactly the shape of its body.
+    values: (N, 7) the parameters of the body's kind (see `shapes`). covariance: (N, 7, 7), of the parameters. shape: (N,) 0
+    point, 1 sphere, 2 ellipsoid, 3 cuboid, 4 cylinder. evidence: (5, N) the logarithm of the evidence of each shape, plus
+    the logarithm of the share of the shape (`with_shares_of_shapes`). weight: (B,) the robust weight of each box. share:
+    (2,) the standard deviations of the errors of shift and size that boxes of one side share, as shares of half their size.
+    factors: (2,) on the nominal noise of shifts and sizes. to_centre: (B, 3) the unit direction in map to the centre of each
+    body, minus the unit direction to the centre of its predicted box. It is 0 for a point. hidden: (B, 2) the number of
+    edges on each axis that are bounds. between_shapes: (N, 6, 6) m^2, the second moment of centre and half axes over the
+    shapes, about the chosen shape. It also contains the doubt about hidden edges and unseen ends. It is not in `covariance`.
+    unlike: (N, 7, 7) what must be added to `covariance` because no thing has exactly the shape of its body.
     """
 
     values: Floats
@@ -84,7 +91,7 @@ class Bodies:
 
     @property
     def centre_covariance(self) -> Floats:
-        """(N, 3, 3) m^2, of the centres: with the chosen shape, and between the shapes."""
+        """(N, 3, 3) m^2, the covariances of the centres: those of the chosen shape, plus `between_shapes`."""
         return self.covariance[:, :3, :3] + self.between_shapes[:, :3, :3]
 
     @property
@@ -100,9 +107,10 @@ class Bodies:
 class _State:
     """The noise, the prior and the bodies of the rounds so far.
 
-    fitted: for each shape, its bodies (N, 7), which are the starts of the next fit. evidence, shape: see `Bodies`. best: the
-    best of the solid shapes, None before the first round. solid: (N,) the shape of `best`. covariance: (N, 7, 7) of `best`.
-    sized: (N,) whether the size is known, so that no sphere is chosen. others: less probable cuboids of the last round.
+    factors, share: as in `Bodies`. prior: the prior of ellipsoids. fitted: for each shape, its bodies (N, 7), at which the
+    next fit starts. evidence, shape: as in `Bodies`. solid: (N,) the best of the solid shapes (`_SOLID`). best: the fit of
+    this shape, None before the first round. covariance: (N, 7, 7) of `best`. sized: (N,) whether the size is known, so that
+    no sphere is chosen. others: the less probable cuboids of the last round.
     """
 
     factors: Floats
@@ -133,13 +141,13 @@ def solve_bodies(
 ) -> Bodies:
     """Return the bodies of objects at points (N, 3), m, with apparent half axes (N, 2), m, and labels.
 
-    The shapes, the noise and the sizes of labels come from the edges of `measure` alone. If `more` finds more edges, their
-    bodies are then fitted to all edges once more.
+    The shapes, the noise and the sizes of labels come from the edges of `measure` alone. If `more` finds more edges, the
+    bodies with such edges are fitted once more, to all edges. Each round finds the edges beyond which a part of the body is
+    hidden (`hidden_edges`). These edges are bounds in the next round.
 
-    names: the label of each object. side: (B,) px, half the length of the image. share: the prior of `Bodies.share`. learn:
-    whether the share and the noise are estimated. sizes: known length, width and height, m, by label. bent: whether the
-    images are distorted, so that `measure` depends on the points. Each round finds the edges beyond which a part of the body
-    is hidden. These edges are bounds in the next round (`hidden_edges`).
+    names: the label of each object. side: (B,) px, half the length of the image. share: the scale of the prior of
+    `Bodies.share`. learn: whether the share and the noise are estimated. sizes: known length, width and height, m, by label.
+    bent: whether the images are distorted, so that `measure` depends on the points.
     """
     edges = measure(None)
     sides = sides_of(edges, points)
@@ -188,15 +196,17 @@ def solve_bodies(
 
 
 def _counted(edges: BoxEdges, now: _State) -> Floats | None:
-    """Return which residuals (B, 4) count at the bodies of the last round, None before the first."""
+    """Return which residuals (B, 4) count at the bodies of the last round. Return None before the first round."""
     if now.best is None:
         return None
     return residuals_of_shapes(edges, now.best.values, now.solid).use[:, :4]
 
 
 def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats, label: Ints, *, turn: bool) -> _State:
-    """Return the state with the best body of each shape, and for each object the shape with the most evidence. turn: whether
-    cuboids are also tried at other headings (`all_headings`)."""
+    """Return the state with the best body of each shape, and with the most probable shape of each object.
+
+    turn: whether cuboids are also tried at other headings (`all_headings`).
+    """
     weights, first = weights_of(edges, sides.number, now.factors, now.share), now.best is None
     dots, dot_evidence = _dots(edges, now, weights, side)
     ball_prior = sphere_prior(now.prior)
@@ -295,11 +305,13 @@ def _of_shapes(fitted: tuple[Floats, ...], shape: Ints) -> Floats:
 
 
 def _dots(edges: BoxEdges, now: _State, weights: Weights, side: Floats) -> tuple[Floats, Floats]:
-    """Return the objects as points (N, 7), and the logarithm of their evidence (N,). Points do not explain the sizes of
-    boxes."""
+    """Return the objects as points (N, 7), and the logarithm (N,) of the evidence of each point.
+
+    Points do not explain the sizes of boxes.
+    """
     prior, variance, spread = dot_prior(now.prior), weights.variance.copy(), weights.spread.copy()
     free_rows = ~whole_axes(edges)
-    free_rows[:, 2:] = True  # The size of a box is free, and the place of one edge of it too.
+    free_rows[:, 2:] = True  # A point does not explain the size of a box.
     variance[:, :4][free_rows] = spread[:, :4][free_rows] = np.inf
     free = replace(weights, variance=variance, spread=spread)
     found = fit(edges, now.fitted[_POINT], prior, free, ELLIPSOID, still=ENOUGH, most=STEPS)

@@ -1,4 +1,4 @@
-"""Directions to the centres of bodies, from the boxes that show them."""
+"""Compute the directions from the cameras to the centres of bodies, relative to the centres of their predicted boxes."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from objslam.triangulation.bodies.residuals import Residuals, whole_axes
 
 
 def shifts_of(edges: BoxEdges, found: Residuals) -> Floats:
-    """Return by how much predicted boxes lie to the right of the measured ones and below them (B, 2), px.
+    """Return by how much each predicted box lies to the right of the measured box and below it (B, 2), px.
 
-    If one edge of an axis is a bound, the other edge gives the shift. Two bounds give no shift, so it is 0.
+    If one edge of an axis is a bound, the other edge gives the shift. If both edges are bounds, the shift is 0.
     """
     low, high, both = edges.bound[:, :2], edges.bound[:, 2:], found.value[:, :4]
     by_one_edge = np.where(high, np.where(low, 0.0, -both[:, :2]), both[:, 2:])
@@ -20,10 +20,10 @@ def shifts_of(edges: BoxEdges, found: Residuals) -> Floats:
 
 
 def directions_to_centres(edges: BoxEdges, centre: Floats, shift: Floats) -> Floats:
-    """Return unit directions (B, 3) to the centres (N, 3), m, of bodies, minus the unit directions to the centres of
-    predicted boxes.
+    """Return the unit directions (B, 3) in map to the centres (N, 3), m, of bodies, minus the unit directions to the centres
+    of predicted boxes.
 
-    shift: (B, 2) px, by how much the predicted box lies to the right of the detected one, and below it.
+    shift: (B, 2) px, as `shifts_of` returns it.
     """
     ray = edges.direction
     predicted = ray.copy()
