@@ -1,4 +1,4 @@
-"""Detection in a log: the detector finds the boxes in each rgb image."""
+"""Run a detector on a log. The detector finds the boxes in each rgb image."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -84,7 +84,7 @@ def detect_log(
 
 @dataclass(frozen=True)
 class Frame:
-    """One image file. known: its boxes from the cache, if any. image: its pixels, if the cache has no boxes of it.
+    """One image file. known: the boxes from the cache, if any. image: the pixels, if the cache has no boxes of the image.
 
     problem: the reason why the image cannot be used, if any. where: the place of the problem. digest: SHA-256 of the file.
     """

@@ -34,7 +34,7 @@ class Boxes(NamedTuple):
 
 @dataclass(frozen=True)
 class Detector:
-    """A network with its recipe. batch: the most images in one run. warnings: about the model, for the user."""
+    """A network with its recipe. batch: the largest number of images in one run. warnings: texts about the model."""
 
     network: Network
     recipe: Recipe

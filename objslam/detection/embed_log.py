@@ -24,8 +24,8 @@ def embed_log(log: Log, encoder: Encoder, ledger: Ledger, progress: Progress = l
     """Return the log with an appearance vector for each box that has an rgb image. The vectors replace the vectors of the
     log.
 
-    The image of a frame is the nearest image in time, at most `MAX_IMAGE_LAG` away. A frame without an image that can be
-    used is counted, and its boxes stay without a vector. LogError if no frame has an image, DetectorError if the network
+    The image of a frame is the nearest image in time, at most `MAX_IMAGE_LAG` (s) away. A frame without a usable image is
+    counted, and its boxes stay without a vector. Raises LogError if no frame has an image, and DetectorError if the network
     fails.
     """
     cameras, seen = [], 0

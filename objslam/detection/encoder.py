@@ -20,7 +20,7 @@ DESCRIPTION = "objslam.encoder"
 _USER_ONLY = frozenset({"margin", "batch", "size"})
 _SIZE = 224  # The width and height, px, of an input of free size without a setting. Most encoders are trained with it.
 _VECTOR_OUTPUTS = ("image_embeds", "image_features", "pooler_output", "embeddings", "embedding", "features")
-"""The names that exporters give to the output with the vector, the surest first."""
+"""The names that exporters give to the output with the vector. The most reliable name is first."""
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,8 @@ _UNNAMED = "the model names no classes: they are numbered (--names FILE names th
 
 
 def input_size(network: Network, settings: config.Detector) -> InputSize:
-    """Return the size of the network input. A side that the model leaves free comes from the settings, else from the size of
-    training in the metadata, else it is 640 px. Raises ConfigError if the settings have another size than the model."""
+    """Return the size of the network input. A side that the model leaves free has the size in the settings. Without this
+    size, it has the training size in the metadata, else 640 px. Raises ConfigError if the settings and the model differ."""
     image = network.image
     width, height = settings.size or _training_size(network.metadata) or (_SIZE, _SIZE)
     if settings.size is not None and (width, height) != (image.width or width, image.height or height):

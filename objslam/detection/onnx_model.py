@@ -39,11 +39,11 @@ _MOST_MEMORY = 8 * _GIB
 limit is half of its memory. A larger value allows larger models, but a damaged model can then take the memory from all other
 programs. YOLO12n with images of 640 px takes 0.1 GiB."""
 _MOST_PIXELS = 1 << 26
-"""The most pixels of the images of a run, if the model fixes their size and number: an image of 8192x8192. A larger value
-takes more memory before the model runs."""
+"""The largest number of pixels of all images of a run, if the model fixes their size and number. It is the number of pixels
+of an image of 8192x8192. A larger value takes more memory before the model runs."""
 _MOST_VALUES = 1 << 28
-"""The most values of an output. A larger value takes more memory: float64 copies of this number take 2 GiB. YOLO with 80
-classes and an image of 8192x8192 has less than half of it."""
+"""The largest number of values of an output. A larger number takes more memory: float64 copies of this number of values take
+2 GiB. YOLO with 80 classes and an image of 8192x8192 has less than half of this number."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,8 @@ def open_network(path: Path, settings: config.Detector) -> Network:
 
 
 def _digest(path: Path) -> str:
-    """Hash the model and the files beside it whose names begin with its name. Exporters store large weights in these."""
+    """Return the SHA-256 of the model and of the files beside it whose names begin with the model's name. Exporters store
+    large weights in such files."""
     total = hashlib.sha256()
     beside = sorted(p for p in path.parent.iterdir() if p.name.startswith(path.name) and p != path and p.is_file())
     for part in (path, *beside):
@@ -172,10 +173,10 @@ def _memory() -> int:
 
 @cache
 def _limit_memory() -> bool:
-    """Give onnxruntime the memory that the sessions of this process share. It raises an error where they need more.
+    """Limit the memory that the onnxruntime sessions of this process share. A session that needs more raises an error.
 
-    Returns whether this was possible: only a private module of onnxruntime offers it, and the next version may lack it.
-    Without it, the limits on images and outputs remain.
+    Return whether this was possible. Only a private module of onnxruntime has this limit, and the next version may lack the
+    module. Without the limit, the limits on images and outputs remain.
     """
     try:
         from onnxruntime.capi import _pybind_state as ort
@@ -190,7 +191,7 @@ def _limit_memory() -> bool:
 
 
 def _is_refused_memory(error: Exception) -> bool:
-    """Whether onnxruntime ends a run because the computer, or its own pool, has too little memory."""
+    """Return whether a run failed because the computer, or the memory pool of onnxruntime, has too little memory."""
     return any(text in str(error) for text in ("is smaller than requested bytes", "Failed to allocate memory", "bad_alloc"))
 
 

@@ -37,7 +37,8 @@ class Output:
 
 @dataclass(frozen=True)
 class Facts:
-    """The facts that distinguish layouts. height, width: of the input, px. classes: the number of names, None if unknown."""
+    """The facts that distinguish layouts. height, width: the size of the input, px. classes: the number of class names, None
+    if unknown."""
 
     height: int
     width: int

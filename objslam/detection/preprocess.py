@@ -12,8 +12,8 @@ from objslam.errors import ConfigError
 
 @dataclass(frozen=True)
 class Fit:
-    """Where the resized image lies in the network input, px. width, height: of the raw image. content_width, content_height:
-    of the resized image."""
+    """The place of the resized image in the network input, px. width, height: the size of the raw image. content_width,
+    content_height: the size of the resized image."""
 
     width: int
     height: int

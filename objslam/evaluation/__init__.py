@@ -1,2 +1,2 @@
-"""The comparison of a result with the ground truth: alignment, matches, and errors as numbers and as a table. The folder
-`results` reads the results, and the folder `output` draws them."""
+"""Compare a result with the ground truth. The steps are the alignment, the matches, and the errors as numbers and tables.
+`io.results` reads the results."""

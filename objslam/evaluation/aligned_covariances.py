@@ -1,8 +1,8 @@
 """The covariances of a map after its alignment with the truth.
 
-The alignment takes out the part of the shared errors that a transform can express, and spreads a little of each
-object's own error over all others. The remaining errors have another covariance than the map gives. The squared Mahalanobis
-distances after an alignment must use this covariance. Only then do they show whether the covariances of the map are right.
+The alignment removes the part of the shared errors that a transform can express. It also spreads a little of each object's
+own error over all other objects. The remaining errors therefore have another covariance than in the map. The squared
+Mahalanobis distances after an alignment must use this covariance to show whether the covariances of the map are right.
 """
 
 import numpy as np
@@ -12,11 +12,10 @@ from objslam.core.maps.shared_covariance import jacobian, own_part, root_of
 from objslam.evaluation.alignment import Alignment, Transform
 
 _ROTATIONS = {"se2": (2,), "sim2": (2,), "se3": (0, 1, 2), "sim3": (0, 1, 2)}
-"""The axes about which each alignment turns the map."""
+"""The indices of the axes (x, y, z) about which each alignment turns the map."""
 _UNDETERMINED = 1e-6
-"""An alignment leaves out a motion that hardly moves the objects, such as a turn about the line on which all objects lie. It
-is left out if its effect on the objects is smaller than this share of the largest effect. A larger value leaves out more
-motions."""
+"""The least effect of a motion on the objects, as a share of the largest effect. An alignment leaves out motions with a
+smaller effect, such as a turn about a line on which all objects lie. A larger value leaves out more motions."""
 
 
 def aligned_covariances(
@@ -25,10 +24,11 @@ def aligned_covariances(
     """Return the covariances (N, 3, 3), m^2, of the errors that a least-squares alignment of N objects leaves.
 
     Args:
-        points: (N, 3) m, the objects that the alignment matched, in the map.
-        covariance: (N, 3, 3) m^2, in the map.
-        shared: (7, 7) the covariance of the errors that the objects share, None if their errors are independent.
+        points: (N, 3) positions of the matched objects in map, m.
+        covariance: (N, 3, 3) covariances of the positions in map, m^2.
+        shared: (7, 7) covariance of the errors that the objects share, None if the errors are independent.
         transform: the alignment, from map to truth.
+        kind: the kind of the alignment.
     """
     turn = transform.scale * transform.pose[:3, :3]
     if kind == "none" or len(points) == 0:
@@ -44,7 +44,7 @@ def aligned_covariances(
     effect = lever[:, :, free]
     told = effect.copy()
     if kind == "sim2" and 6 in free:
-        told[:, 2, -1] = 0.0  # It takes the scale from x and y alone.
+        told[:, 2, -1] = 0.0  # sim2 computes the scale only from x and y.
     flat = told.reshape(-1, len(free))
     size = np.maximum(np.linalg.norm(flat, axis=0), 1e-12)
     gain = (np.linalg.pinv(flat / size, rcond=_UNDETERMINED) / size[:, None]).reshape(len(free), len(points), 3)
@@ -57,5 +57,5 @@ def aligned_covariances(
 
 
 def _common(gain: Floats, factor: Floats) -> Floats:
-    """Return how each shared error moves the alignment, (d, m). gain: (d, N, 3). factor: (N, 3, m)."""
+    """Return the effect (d, m) of m shared errors on the d motions of the alignment. gain: (d, N, 3). factor: (N, 3, m)."""
     return np.asarray(np.einsum("dni,nim->dm", gain, factor))

@@ -1,4 +1,4 @@
-"""Matching of map objects with true objects, and alignment of the map with the ground truth."""
+"""Match map objects with true objects, and align the map with the ground truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,21 +14,21 @@ from objslam.core.trajectory import Trajectory
 from objslam.core.types import Truth, TruthObject
 
 Alignment = Literal["none", "se2", "sim2", "se3", "sim3"]
-"""The alignment of a map with the truth: none, se2 (yaw and translation), se3 (rotation and translation), and sim2 and sim3,
-which also have a scale."""
+"""The kind of the alignment of a map with the truth: none, se2 (yaw and translation), se3 (rotation and translation), sim2
+(se2 with a scale) or sim3 (se3 with a scale)."""
 
-_MAX_CORRESPONDENCES = 2000  # With more correspondences, pairs of them are sampled. A larger number is slower.
+_MAX_CORRESPONDENCES = 2000  # The most correspondences of which all pairs are tried, not a sample. More are slower.
 _DRAWN_PAIRS = 200_000  # The number of sampled pairs or triples of correspondences. A larger number is slower.
-_MAX_TRIPLED = 80  # With more correspondences, triples of them are sampled: 80 have 82,160 triples. More are slower.
-_MAX_STARTS = 3000  # The most initial transforms that are scored. More are slower.
+_MAX_TRIPLED = 80  # The most correspondences of which all triples (82,160) are tried, not a sample. More are slower.
+_MAX_STARTS = 3000  # The most initial transforms from pairs that are scored. A larger number is slower.
 _MAX_TRIPLES = 1000  # The most initial transforms from triples. Triples are right more often than pairs, so fewer suffice.
-_DISTANCES = 1_000_000  # The number of distances that are computed at once. More take more memory: 24 MB for a million.
+_DISTANCES = 1_000_000  # The number of distances computed at once. A larger number takes more memory: 24 MB for a million.
 _MAX_REFINED = 12  # The number of the best initial transforms that are refined. A larger number is more reliable and slower.
 _MAX_ROUNDS = 50
-"""The maximum number of rounds of matching and aligning, if the matches do not converge. A larger number takes longer."""
+"""The largest number of rounds of matching and aligning if the matches do not converge. A larger number takes longer."""
 _ON_A_LINE = 0.02
-"""The corners of a triangle are on a line if the sine of an angle is at most this. Position errors of 2 % of the triangle's
-length leave its turn about this line open. A larger value leaves more triples out."""
+"""The largest sine of an angle of a triangle whose corners count as on a line. With position errors of 2 % of the triangle's
+length, the rotation about this line is unknown. A larger value leaves out more triples."""
 _SCALES = (0.1, 10.0)  # The smallest and largest scale from map to truth that sim2 and sim3 search.
 
 
@@ -40,7 +40,7 @@ class Transform:
     scale: float = 1.0
 
     def apply(self, points: Floats) -> Floats:
-        """Transform points (..., 3)."""
+        """Return points (..., 3), m, after the transform."""
         return self.scale * points @ self.pose[:3, :3].T + self.pose[:3, 3]
 
 
@@ -130,9 +130,9 @@ def _refine(
 
 
 def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Alignment) -> list[Transform]:
-    """Return the best initial transforms. Each aligns two map objects with two true objects.
+    """Return the best initial transforms. Each transform aligns two map objects with two true objects.
 
-    For se3 and sim3, each aligns three objects. If no group of objects fits, smaller groups are aligned.
+    For se3 and sim3, each transform aligns three objects. If no triple fits, pairs are aligned, and then single objects.
     """
     i, k = np.nonzero(same)
     if kind in ("se3", "sim3"):
@@ -169,9 +169,10 @@ def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Al
 
 
 def _starts_in_space(source: Floats, target: Floats, i: Ints, k: Ints, radius: float, kind: Alignment) -> list[Transform]:
-    """Return alignments of three map objects with three true objects, from the correspondences (i, k). Empty if none fit.
+    """Return alignments of three map objects with three true objects. The list is empty if no triple fits.
 
-    Each aligns a triangle with a triangle. Three objects on a line form no triangle.
+    i, k: the indices of the map object and of the true object of each correspondence. Each transform aligns a triangle with
+    a triangle. Three objects on a line form no triangle.
     """
     rng = np.random.default_rng(0)
     if len(i) <= _MAX_TRIPLED:
@@ -200,7 +201,7 @@ def _starts_in_space(source: Floats, target: Floats, i: Ints, k: Ints, radius: f
 
 
 def _frames(corners: Floats) -> Floats:
-    """Return right-handed axes (T, 3, 3) of triangles (T, 3, 3); NaN for one whose corners lie on a line."""
+    """Return right-handed axes (T, 3, 3) of triangles (T, 3, 3). The axes are NaN if the corners are on a line."""
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(first, second)
     length = np.linalg.norm(normal, axis=1)
@@ -236,8 +237,8 @@ def _nearest_costs(starts: list[Transform], source: Floats, target: Floats, same
 def lay_truth(objects: ObjectMap, truth: Truth) -> Truth:
     """Return the ground truth in the coordinate frame of the map, so that both can be drawn together.
 
-    A map from odometry alone has its own frame. The truth is aligned with the map in the plane if fewer than half of the
-    possible matches are within 0.5 m and the alignment adds matches. If not, the truth is returned unchanged.
+    A map from odometry without localisation has its own frame. The truth is aligned with the map in the plane if fewer than
+    half of the possible matches are within 0.5 m and the alignment adds matches. If not, the truth is returned unchanged.
     """
     radius = 0.5
     source, target, same = correspondences(objects.resolved(), truth.objects)

@@ -14,17 +14,17 @@ from objslam.core.types import TruthObject
 from objslam.evaluation.alignment import Transform
 
 _SQUARE = 1.1
-"""The ratio of true length and width below which an object has no heading to compare. A larger ratio compares fewer
-headings."""
+"""The least ratio of true length to true width of an object whose heading is compared. With a larger ratio, fewer headings
+are compared."""
 
 
 @dataclass(frozen=True)
 class BodyMatch:
-    """A body against a true body, after the alignment.
+    """The errors of a body compared with the true body, after the alignment.
 
-    size_error: (3,) length, width and height, as shares of the true sizes. yaw_error: rad in [0, pi/2], None if the true
-    object is about square or has no yaw. iou: the intersection over union of the upright boxes around the two
-    bodies, because a true object has no shape. None without a true yaw.
+    size_error: (3,) errors of length, width and height, as shares of the true sizes. yaw_error: rad, in [0, pi/2]. It is
+    None if the true object is about square or has no yaw. iou: the intersection over union of the upright boxes around the
+    two bodies, because a true object has no shape. It is None without a true yaw.
     """
 
     size_error: Floats
@@ -38,7 +38,7 @@ class BodyMatch:
 
 
 def match_bodies(found: MapObject, true: TruthObject, transform: Transform) -> BodyMatch | None:
-    """Return how the body of a map object fits the true body, None if one of the two has no size."""
+    """Return the errors of the body of a map object, or None if the map object has no body or the true object no size."""
     if found.body is None or true.size is None:
         return None
     size = found.body.size * transform.scale
@@ -54,7 +54,7 @@ def match_bodies(found: MapObject, true: TruthObject, transform: Transform) -> B
 
 
 def body_scores(matches: list[BodyMatch]) -> dict[str, float | int | None]:
-    """Return the number of compared bodies, and the medians of the size's error, the yaw's error (degrees) and the IoU."""
+    """Return the number of compared bodies, and the medians of the size error, the yaw error (degrees) and the IoU."""
     sizes = [np.abs(m.size_error).mean() for m in matches]
     yaws = [np.degrees(m.yaw_error) for m in matches if m.yaw_error is not None]
     overlaps = [m.iou for m in matches if m.iou is not None]

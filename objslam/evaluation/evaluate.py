@@ -18,7 +18,7 @@ from objslam.evaluation.bodies import BodyMatch, body_scores, match_bodies
 from objslam.evaluation.tags import TagMatch, match_tags, tag_scores
 
 MAX_TRUTH_GAP = 1.0
-"""The true path is interpolated in gaps of at most this length, s. A pose in a longer gap has no true pose."""
+"""The longest gap of the true path in which it is interpolated, s. A pose in a longer gap has no true pose."""
 INSIDE_95 = 5.991
 """The squared Mahalanobis distance within which 95 % of the errors in x and y lie if their covariances are right
 (chi-squared, 2 degrees of freedom)."""
@@ -30,11 +30,11 @@ INSIDE_95_3D = 7.815
 class Match:
     """A map object and the true object that it matches. `offset` (3,) is map minus truth, m, after the alignment.
 
-    squared: squared Mahalanobis distance of the offset in x and y, by the covariance that the alignment leaves
-    (`aligned_covariances`). squared_3d: the squared distance in x, y and z. Both are None without a covariance, and if the
-    alignment rests on so few objects that it leaves hardly any error.
-    body: how the two bodies fit, None if one of the two has no size. tag: how the rotations of two fiducials fit, None if
-    one of the two has none.
+    squared: the squared Mahalanobis distance of the offset in x and y, with the covariance after the alignment
+    (`aligned_covariances`). squared_3d: the squared distance in x, y and z. Both are None without a covariance. They are
+    also None if the alignment uses too few objects, because hardly any error then remains.
+    body: the errors of the body, None if one of the two has no size. tag: the error of the rotation of a fiducial, None if
+    one of the two has no rotation.
     """
 
     object: MapObject
@@ -66,7 +66,7 @@ class ObjectScores:
     unresolved: int
     transform: Transform
     shared_known: bool = True
-    """Whether the map says which errors its objects share, or was not aligned."""
+    """Whether the map has the covariance of the errors that its objects share, or was not aligned."""
 
     @property
     def errors(self) -> Floats:
@@ -96,7 +96,7 @@ class PathScores:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The evaluation of a result. `objects` or `path` is None if the ground truth has nothing to compare it with."""
+    """The evaluation of a result. objects: None without true objects. path: None without a path or without a true path."""
 
     objects: ObjectScores | None
     path: PathScores | None
@@ -106,7 +106,7 @@ class Evaluation:
     truth: str | None = None
     """The path of the ground truth, or None if it is the truth of the log."""
     why: str = "as asked"
-    """The reason for the alignment."""
+    """The reason for the kind of the alignment, as text."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of evaluation.json. Values are in m and deg. A missing value is None."""
@@ -122,7 +122,7 @@ class Evaluation:
         }
 
 
-_NAMED = 3  # The most labels that a warning names. A larger number makes the line longer.
+_NAMED = 3  # The largest number of labels in a warning. A larger number makes the line longer.
 
 
 def evaluate(
@@ -137,8 +137,8 @@ def evaluate(
 
     Args:
         trajectory: poses map_T_base.
-        align: kind of the alignment. Objects are aligned by their matches, and the path by its poses.
-        radius: maximum distance of a match in m. Only objects with the same label can match.
+        align: the kind of the alignment. Objects are aligned by their matches, and the path by its poses.
+        radius: the largest distance of a match, m. Only objects with the same label can match.
     Raises:
         LogError: there is no truth to compare with.
         ConfigError: the radius is not positive.
@@ -208,7 +208,7 @@ def _covariances_left(
 
 
 def _match(found: MapObject, true: TruthObject, offset: Floats, transform: Transform, covariance: Floats | None) -> Match:
-    """Return a match. offset (3,) m, covariance (3, 3) m^2: of the object after the alignment."""
+    """Return a match. offset: (3,) m, covariance: (3, 3) m^2. Both are those of the object after the alignment."""
     shape = match_bodies(found, true, transform), match_tags(found, true, transform)
     if covariance is None:
         return Match(found, true, offset, None, None, *shape)
@@ -220,7 +220,7 @@ def _squared(offset: Floats, covariance: Floats) -> float:
 
 
 def _fewest(kind: Alignment) -> int:
-    """Return the least number of matched objects whose errors mean something after an alignment."""
+    """Return the least number of matched objects for which the errors after an alignment are reliable."""
     return 4 if kind in ("se3", "sim3") else 3
 
 

@@ -1,4 +1,4 @@
-"""Evaluation of a result folder: its truth, the alignment that its frame needs, and evaluation.json."""
+"""Evaluate a result folder: find the ground truth, choose the alignment for the map's frame, and write evaluation.json."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -42,8 +42,8 @@ def evaluate_folder(
 ) -> Evaluation:
     """Compare the result folder `out` with the ground truth at the path `truth` (see `load_truth`).
 
-    By default, the ground truth of the result's log is used. LogError if there is no truth, OutputError if the result cannot
-    be read, ConfigError if the radius is not positive.
+    By default, the ground truth of the result's log is used. radius: the largest distance of a match, m. Raises LogError if
+    there is no truth, OutputError if the result cannot be read, and ConfigError if the radius is not positive.
     """
     check_radius(radius)
     map_, known = load_map(out), load_truth(truth or out)
@@ -61,5 +61,5 @@ def evaluate_folder(
 
 
 def write_evaluation(evaluation: Evaluation, out: Path) -> None:
-    """Write evaluation.json into the result folder `out`. OutputError if the file cannot be written."""
+    """Write evaluation.json into the result folder `out`. Raises OutputError if the file cannot be written."""
     write_file(out / EVALUATION, dump_json(evaluation.to_dict()).encode())

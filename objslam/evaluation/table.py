@@ -1,4 +1,4 @@
-"""Tables of an evaluation for a terminal."""
+"""Make the tables of an evaluation for a terminal."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _OBJECT_ROWS = (
     ("inside_95_3d", "share of truths inside the 95 % ellipsoid", ""),
 )
 _NOT_SHARED = {"mahalanobis_median": "squared Mahalanobis in x, y, median (honest: 1.39 or less)"}
-"""The names of rows that differ after an alignment, if the map does not say which errors its objects share. An alignment may
+"""Other names of rows, for an aligned map without the covariance of the errors that its objects share. An alignment may
 remove such errors, but the covariances still contain them."""
 _BODY_ROWS = (
     ("bodies", "bodies compared", ""),

@@ -18,17 +18,16 @@ of freedom)."""
 
 @dataclass(frozen=True)
 class TagMatch:
-    """The rotation of a fiducial, compared with the true rotation after the alignment. error: rad, the angle between its
-    rotation and the true rotation. squared: the squared Mahalanobis distance of the rotations. If the fiducial may have a
-    second rotation, the nearer one of the two counts."""
+    """The errors of the rotation of a fiducial after the alignment. error: the angle between its first rotation and the true
+    rotation, rad. squared: the squared Mahalanobis distance of the rotations. If the fiducial may have a second rotation,
+    this is the smaller one of the two distances."""
 
     error: float
     squared: float
 
 
 def match_tags(found: MapObject, true: TruthObject, transform: Transform) -> TagMatch | None:
-    """Compare the rotation of a fiducial with the true rotation. Returns None if the map or the truth has no rotation of
-    it."""
+    """Return the errors of the rotation of a fiducial, or None if the map object or the true object has no rotation."""
     if found.tag is None or true.tag_xyzw is None:
         return None
     truth = transform.pose[:3, :3].T @ rotation_from_quaternion(true.tag_xyzw[None])[0]

@@ -1,4 +1,4 @@
 """Read and write files, with one module per format.
 
-`results` reads result folders back. Folders of logs are in `sources`, and `output` writes results.
+`results` reads result folders. The package `sources` reads the folders of logs, and the package `output` writes results.
 """

@@ -23,7 +23,7 @@ _UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP, errno.ENOLCK, errno.ENOSYS)
 class FileSet:
     """The names of files that are replaced together."""
 
-    seal: str  # Deleted first and written last, so it exists only in a complete set.
+    seal: str  # The name of the file that is deleted first and written last. So this file exists only in a complete set.
     others: tuple[str, ...]  # The other files of the set, including optional files.
     pattern: str  # A glob pattern for files whose names vary.
 
@@ -33,9 +33,9 @@ class FileSet:
 
 
 def try_folder(folder: Path, files: FileSet) -> None:
-    """Create a folder and test writing to it. The temporary files of this set that killed processes left behind are deleted.
+    """Create a folder and write a test file to it. Delete the temporary files of this set that killed processes left.
 
-    Raises OutputError if `replace_files` would fail.
+    Raises OutputError for a disk error, or if another run is writing to the folder.
     """
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -48,9 +48,9 @@ def try_folder(folder: Path, files: FileSet) -> None:
 def replace_files(folder: Path, files: FileSet, writers: dict[str, Callable[[Path], object]]) -> tuple[str, ...]:
     """Replace a set of files in a folder. Return the names of the old files that have no replacement.
 
-    writers: the function that writes each file, by file name. New files are first written to a staging folder. Then
-    all files of the old set are deleted. Then the new files are renamed, the seal last. A killed process therefore never
-    leaves a half-written file, a mix of two sets, or a seal in an incomplete set. Other files in the folder are not changed.
+    writers: maps the name of each new file to the function that writes it. New files are first written to a staging folder.
+    All files of the old set are then deleted. At the end, the new files are renamed, the seal last. A killed process
+    therefore never leaves a half-written file, a mix of two sets, or a seal in an incomplete set. Other files do not change.
     Raises OutputError for a disk error, or if another run is writing to the folder.
     """
     with disk_errors(folder), _staged(folder, files) as staging:
@@ -62,7 +62,7 @@ def replace_files(folder: Path, files: FileSet, writers: dict[str, Callable[[Pat
 
 
 def is_cut_short(folder: Path, files: FileSet) -> bool:
-    """Return whether a replacement was interrupted, so that the folder contains an incomplete set."""
+    """Return whether the folder contains an incomplete set because `replace_files` was interrupted."""
     return (folder / _STAGING / _SWAPPING).exists() and not (folder / files.seal).exists()
 
 
@@ -72,18 +72,17 @@ def has_staging(folder: Path) -> bool:
 
 
 def write_file(file: Path, data: bytes, *, tidy: bool = True) -> None:
-    """Write one file under a temporary name and rename it. The temporary files that killed processes left behind are deleted
-    first.
+    """Write one file under a temporary name, then rename it to `file`. Raises OutputError with this name for a disk error.
 
-    tidy: whether to look for such files. The search lists the whole folder, so it takes long in a folder of many files.
-    Raises OutputError with the final file name for a disk error.
+    tidy: whether to first delete the temporary files of `file` that killed processes left. The search for these files lists
+    the whole folder, so it takes long in a folder with many files.
     """
     with _replaced(file, tidy=tidy) as stream:
         stream.write(data)
 
 
 def write_lines(file: Path, lines: Iterable[str]) -> None:
-    """Write a text file of lines as `write_file` does, line by line. Raises what `write_file` and `lines` raise."""
+    """Write a text file line by line, as `write_file` does. Raises the errors of `write_file`, `encode` and `lines`."""
     with _replaced(file) as stream:
         for line in lines:
             stream.write(encode(f"{line}\n"))
@@ -92,8 +91,8 @@ def write_lines(file: Path, lines: Iterable[str]) -> None:
 def copy_files(files: Iterable[Path], folder: Path) -> None:
     """Copy files into an existing folder. Each file appears whole.
 
-    At the end, all of them are on the disk. So they survive each power cut that a file written later survives. Raises
-    OutputError for a disk error.
+    The function returns when all copies are on the disk, so that a later power cut does not remove them. Raises OutputError
+    for a disk error.
     """
     with disk_errors(folder):
         for file in files:
@@ -111,8 +110,10 @@ def copy_files(files: Iterable[Path], folder: Path) -> None:
 
 @contextmanager
 def _replaced(file: Path, *, tidy: bool = True) -> Iterator[BinaryIO]:
-    """Yield a stream to a temporary file, which is renamed to `file` at the end. After an error, the temporary file is
-    deleted. tidy: as for `write_file`."""
+    """Yield a stream to a temporary file. Rename this file to `file` at the end, or delete it after an error.
+
+    tidy: as for `write_file`.
+    """
     temporary = file.with_name(temporary_name(file))
     with disk_errors(file, only=True):
         if tidy:
@@ -139,8 +140,10 @@ def encode(text: str) -> bytes:
 
 @contextmanager
 def disk_errors(path: Path, *, only: bool = False) -> Iterator[None]:
-    """Turn OSError into OutputError with the name of the failing file. If this name is
-    unknown, or with `only`, the error names `path`."""
+    """Turn each OSError of the block into an OutputError that names the failing file.
+
+    The error names `path` instead if the failing file is unknown, or if `only` is True.
+    """
     try:
         yield
     except OSError as error:
@@ -149,8 +152,10 @@ def disk_errors(path: Path, *, only: bool = False) -> Iterator[None]:
 
 
 def try_lock(stream: BinaryIO | int) -> bool:
-    """Lock an open file, or its descriptor, without waiting. Return whether it is locked now: False if another holder has
-    the lock. The lock ends when the file is closed. Raises OSError if the file system has no locks."""
+    """Lock an open file without waiting. Return True if this call locked it, and False if another holder has the lock.
+
+    stream: the file or its descriptor. Closing the file ends the lock. Raises OSError if the file system has no locks.
+    """
     try:
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -159,7 +164,8 @@ def try_lock(stream: BinaryIO | int) -> bool:
 
 
 def is_locked(file: Path) -> bool:
-    """Return whether a process holds the lock on a file. It is False without the file, or if the file system has no locks.
+    """Return whether a process holds the lock on a file. Return False if there is no such file, or if the file system has
+    no locks.
 
     Raises OSError if the file cannot be read.
     """
@@ -170,7 +176,7 @@ def is_locked(file: Path) -> bool:
 
 
 def _is_locked(handle: int) -> bool:
-    """Lock a descriptor, and return whether another holder has the lock. It is False if the file system has no locks."""
+    """Try to lock a descriptor. Return whether another holder has the lock, or False if the file system has no locks."""
     try:
         return not try_lock(handle)
     except OSError as error:
@@ -181,7 +187,7 @@ def _is_locked(handle: int) -> bool:
 
 @contextmanager
 def _staged(folder: Path, files: FileSet) -> Iterator[Path]:
-    """Lock a folder and yield an empty staging folder in it. The remains of an interrupted run are deleted."""
+    """Lock a folder and yield an empty staging folder in it. Delete what an interrupted run left in the folder."""
     staging = folder / _STAGING
     handle = os.open(folder, os.O_RDONLY)
     try:
@@ -203,7 +209,10 @@ def _staged(folder: Path, files: FileSet) -> Iterator[Path]:
 
 
 def _swap(staging: Path, folder: Path, files: FileSet) -> tuple[str, ...]:
-    """Replace the old files by the staged files, in an order in which a killed process never leaves a mix of two sets."""
+    """Replace the old files by the staged files. Return the names of the old files that have no replacement.
+
+    The order of the steps ensures that a killed process never leaves a mix of two sets.
+    """
     old = files.names(folder)
     removed = tuple(name for name in old if (folder / name).exists() and not (staging / name).exists())
     _write(staging / _SWAPPING, b"")

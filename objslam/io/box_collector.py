@@ -12,14 +12,16 @@ from objslam.core.validity import box_rules, is_name, valid_corners, valid_depth
 from objslam.io.text import drop_rows, in_order
 
 UNUSABLE_FEATURES = "features of a box that are zero, not finite, or of another length than most (the box stays)"
-"""The reason to leave out the appearance vector of a box."""
+"""The reason in the ledger for each box whose appearance vector is left out."""
 
 
 @dataclass
 class BoxCollector:
-    """Camera frames (images) and their boxes. An unknown depth is NaN, and an unknown track id is -1. The corners of
-    fiducials and the appearance vectors are stored by the index of their box. Each frame and box has a place, such as
-    file:line. The ledger shows the place if the frame or box is dropped."""
+    """Camera frames (images) and their boxes. An unknown depth is NaN, and an unknown track id is -1.
+
+    The keys of `corners` (of fiducials) and `features` (appearance vectors) are indices of boxes. Each frame and box has a
+    place, such as file:line. The ledger shows the place if the frame or box is dropped.
+    """
 
     stamps: list[float] = field(default_factory=list)
     frame_places: list[str] = field(default_factory=list)
@@ -34,7 +36,7 @@ class BoxCollector:
     features: dict[int, Array] = field(default_factory=dict)
 
     def add_frame(self, stamp: float, place: str) -> None:
-        """Start a frame. The next boxes belong to it."""
+        """Start a frame at timestamp `stamp` (s). The boxes that are added next belong to this frame."""
         self.stamps.append(stamp)
         self.frame_places.append(place)
 
@@ -49,8 +51,10 @@ class BoxCollector:
         corners: list[list[float]] | None = None,
         features: list[float] | None = None,
     ) -> None:
-        """Add a box x1, y1, x2, y2 (px) to the last frame. corners: the four corners x, y (px) of a square fiducial.
-        features: its appearance vector, of any length above zero."""
+        """Add a box x1, y1, x2, y2 (px) to the last frame. depth: the depth z along the optical axis, m.
+
+        corners: the four corners x, y (px) of a square fiducial. features: the appearance vector of the box, of any length.
+        """
         if features is not None:
             self.features[len(self.boxes)] = np.array(features)
         if corners is not None:
@@ -64,9 +68,11 @@ class BoxCollector:
         self.box_places.append(place)
 
     def checked(self, ledger: Ledger) -> Detections:
-        """Return the valid detections. Frames out of time order and invalid boxes are dropped and counted. Three
-        things become unknown and are counted: a depth that is not above zero or too large, corners that form no square, and
-        appearance vectors that cannot be compared."""
+        """Return the valid detections. Frames out of time order and invalid boxes are dropped and counted in the ledger.
+
+        Some values of a valid box become unknown, and are counted. They are a depth that is too large or not above zero,
+        corners that form no square, and an appearance vector for the reasons of `UNUSABLE_FEATURES`.
+        """
         stamps = np.array(self.stamps, dtype=np.float64)
         forward = in_order(stamps)
         drop_rows("detection frame with a stamp that repeats or goes back", ~forward, self.frame_places, ledger)
@@ -101,7 +107,10 @@ class BoxCollector:
         )
 
     def _valid_corners(self, good: Bools, ledger: Ledger) -> Floats:
-        """Return the corners (M, 4, 2) px of all boxes (M,), NaN where they are unknown or not valid."""
+        """Return the corners (M, 4, 2), px, of all M boxes. Unknown and invalid corners are NaN.
+
+        good: (M,) the boxes whose invalid corners are counted.
+        """
         corners = np.full((len(self.boxes), 4, 2), np.nan)
         corners[list(self.corners)] = np.array(list(self.corners.values()), dtype=np.float64)
         wrong = np.isin(np.arange(len(corners)), list(self.corners)) & ~valid_corners(corners)
@@ -111,9 +120,10 @@ class BoxCollector:
         return corners
 
     def _valid_features(self, good: Bools, ledger: Ledger) -> Floats32 | None:
-        """Return the unit appearance vectors (M, D) of all boxes, NaN for a box without a valid one. None if all are wrong.
+        """Return the unit appearance vectors (M, D) of all boxes, or None if no vector is valid.
 
-        A log has vectors of one length, the most frequent one. If two lengths are equally frequent, the first one counts.
+        A box without a valid vector has NaN. D is the most frequent length of the vectors. If two lengths are equally
+        frequent, D is the one that occurs first. Vectors of other lengths are invalid.
         """
         boxes = np.array(list(self.features), dtype=np.int64)
         lengths = np.array([vector.size for vector in self.features.values()])

@@ -1,4 +1,4 @@
-"""Read and write the shared errors of a robot as YAML: the output of `objslam calibrate`, from which a run can start."""
+"""Read and write the shared errors of a robot as YAML. `objslam calibrate` writes this file, and a run can start from it."""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from objslam.errors import ConfigError, LogError, one_line
 from objslam.io.text import read_bytes
 
 _MOST_BYTES = 1 << 20
-"""The largest size of a file, bytes. A larger file is refused unread. A robot with ten cameras needs 100 kB."""
+"""The largest size of a calibration file, bytes. A larger file is refused unread. A robot with ten cameras needs 100 kB."""
 _HINT = "write it with objslam calibrate"
 
 
@@ -24,9 +24,9 @@ def dump_calibration(calibration: Calibration) -> str:
 
 
 def load_calibration(path: Path) -> Calibration:
-    """Read a file of `objslam calibrate`, or the summary.json of a run that estimated the shared errors.
+    """Return the shared errors from a file of `objslam calibrate`, or from the summary.json of a run that estimated them.
 
-    ConfigError names the file and what is wrong in it.
+    Raises ConfigError, which names the file and the fault in it.
     """
     try:
         if path.is_file() and path.stat().st_size > _MOST_BYTES:
@@ -42,7 +42,7 @@ def load_calibration(path: Path) -> Calibration:
 
 
 def _refuse_duplicates(node: yaml.Node | None) -> None:
-    """Raise ValueError if a mapping, or a mapping inside it, has a key twice. PyYAML would take the last value."""
+    """Raise ValueError if a mapping, or a mapping in its values, has a key twice. PyYAML would take the last value."""
     seen = set()
     for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
         if not isinstance(key, yaml.ScalarNode):
@@ -54,7 +54,7 @@ def _refuse_duplicates(node: yaml.Node | None) -> None:
 
 
 def _calibration(data: Any) -> Calibration:
-    """Return the calibration in the data of a YAML file. ValueError says what is wrong."""
+    """Return the calibration in the data of a YAML file. Raises ValueError, which says what is wrong."""
     if isinstance(data, dict) and "calibration" in data:  # the summary.json of a run
         data = data["calibration"]
     parameters = data.get("parameters") if isinstance(data, dict) else None
@@ -73,7 +73,10 @@ def _calibration(data: Any) -> Calibration:
 
 
 def _column(parameters: dict[Any, Any], key: str, default: float | None = None) -> Floats:
-    """Return the number (P,) under `key` of each parameter. A parameter without the key has the number `default`."""
+    """Return the numbers (P,) that the P parameters have under `key`. A parameter without the key has `default`.
+
+    Raises ValueError for a value that is not a finite number.
+    """
     numbers = []
     for name, of in parameters.items():
         value = of.get(key, default) if isinstance(of, dict) else None
@@ -87,7 +90,7 @@ def _column(parameters: dict[Any, Any], key: str, default: float | None = None) 
 
 
 def _covariance(data: dict[str, Any], key: str, names: tuple[str, ...]) -> Floats:
-    """Return the covariance (P, P) under `key`. ValueError says what is wrong."""
+    """Return the covariance (P, P) of the parameters under `key`. Raises ValueError, which says what is wrong."""
     size, rows = len(names), data.get(key)
     if not isinstance(rows, list) or len(rows) != size or any(not isinstance(r, list) or len(r) != size for r in rows):
         raise ValueError(f"{key} must be {size} x {size} numbers, as there are {size} parameters")

@@ -1,6 +1,6 @@
 """Read and write camera.yaml, which has ROS camera_info keys and the pose of the camera on the robot.
 
-The reader uses YAML nodes, because they keep line numbers. It takes 1e-05 for a number, although YAML 1.1 takes it for text.
+The reader uses YAML nodes, because they keep line numbers. It also reads 1e-05 as a number, although YAML 1.1 reads text.
 """
 
 import math
@@ -27,21 +27,21 @@ _FORMS = {
     "base_T_camera": f"base_T_camera: {{translation: [x, y, z], {_AHEAD}}} for a camera that looks straight ahead",
     "rotation_xyzw": f"{_AHEAD} for a camera that looks straight ahead",
 }
-"""The right form of keys that people often write in another way."""
+"""Examples of keys with values in the right form, for error messages. People often write these keys in another way."""
 _KEYS = frozenset(
     (
         *("camera_name", "image_width", "image_height", "camera_matrix", "distortion_model", "distortion_coefficients"),
         *("base_T_camera", "depth_scale", "depth_noise", "sees_size", "rectification_matrix", "projection_matrix"),
     )
 )
-"""The keys of a camera. Files of ROS have the last two, which are not read."""
+"""The known keys of a camera. The last two occur in files of ROS, and are not read."""
 _Mapping = dict[str, yaml.Node]
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera from a file. placed: whether the file has base_T_camera. If it has none, the pose of the camera is
-    the identity."""
+    """A camera from a file. placed: whether the file has base_T_camera. If the file does not have it, the pose of the
+    camera is the identity."""
 
     camera: Camera
     placed: bool
@@ -49,7 +49,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Mount:
-    """The pose of a camera on the robot, from a file without the camera's calibration. name: "" if the file has no name."""
+    """The pose (4, 4) of a camera on the robot, from a file without the camera's calibration. name: "" if it is missing."""
 
     name: str
     base_T_camera: Floats
@@ -60,24 +60,26 @@ def read_camera(
 ) -> Camera:
     """Read a camera file. Raises LogError with the line of an invalid value.
 
-    name: the camera name. None takes camera_name from the file, or "camera" if the file has no name.
-    place_needed: whether base_T_camera must be in the file. If False, a missing base_T_camera is the identity. depth_scale:
-    the units per metre of depth images, used if the file has no depth_scale.
+    name: the camera name. If it is None, the name is camera_name from the file, or "camera" if the file has no name.
+    place_needed: whether base_T_camera must be in the file. If False, a missing base_T_camera is the identity.
+    depth_scale: the value for a file without depth_scale, in units of the depth image per metre.
     """
     return _read(path, _load(path, read_bytes(path), "the file"), ledger, name, place_needed, depth_scale).camera
 
 
 def read_calibrations(path: Path, ledger: Ledger) -> tuple[Calibration, ...]:
-    """Read one camera, or several named cameras under the key `cameras`. Raises LogError with the line of an error.
+    """Return the camera of a file, or its named cameras under the key `cameras`. Raises LogError with the line of an error.
 
-    Cameras for which the file has only base_T_camera are left to `read_mounts`.
+    Cameras for which the file has only base_T_camera are left out. `read_mounts` reads them.
     """
     return tuple(_read(path, keys, ledger, name) for name, keys in _sections(path) if not _only_mount(keys))
 
 
 def read_mounts(path: Path) -> tuple[Mount, ...]:
-    """Read the cameras for which a file has only base_T_camera, and perhaps a name. `read_calibrations` reads all
-    other cameras."""
+    """Return the cameras for which a file has only base_T_camera and perhaps a name. `read_calibrations` reads all others.
+
+    Raises LogError with the line of an error.
+    """
     named = [(name, keys) for name, keys in _sections(path) if _only_mount(keys)]
     return tuple(
         Mount(
@@ -135,7 +137,10 @@ def _read(
 
 
 def parse_camera(text: bytes, place: str, ledger: Ledger, name: str | None) -> Camera:
-    """Parse a camera from a text in the format of a camera file. Raises LogError, which names `place` as the file."""
+    """Return the camera in the text of a camera file. Raises LogError, which names `place` as the file.
+
+    name: the camera name, as for `read_camera`. The text must have base_T_camera.
+    """
     path = Path(place)
     return _read(path, _load(path, text, "the camera"), ledger, name, True).camera
 
@@ -151,7 +156,7 @@ def dump_camera(camera: Camera) -> str:
 
 
 def camera_keys(camera: Camera) -> dict[str, Any]:
-    """Return the keys and values of a camera file."""
+    """Return the keys and values of a camera file for `camera`."""
     return {
         "camera_name": camera.name,
         "image_width": int(camera.width),
@@ -167,7 +172,7 @@ def camera_keys(camera: Camera) -> dict[str, Any]:
 
 
 def write_mounts(mounts: Mapping[str, Floats], path: Path) -> None:
-    """Write base_T_camera (4, 4) of cameras by name, as `read_mounts` reads them."""
+    """Write a file that `read_mounts` reads. mounts: maps the name of each camera to its base_T_camera (4, 4)."""
     cameras = {name: {"base_T_camera": _written(pose)} for name, pose in mounts.items()}
     path.write_text(_dumped({_CAMERAS: cameras}), encoding="utf-8")
 
@@ -185,7 +190,7 @@ def _error(path: Path, node: yaml.Node, message: str, hint: str | None = None) -
 
 
 def _load(path: Path, text: bytes, what: str) -> _Mapping:
-    """Return the values of a YAML text by key. `what` is the name of the text in error messages."""
+    """Return the nodes of the values in a YAML mapping, by key. `what` is the name of the text in error messages."""
     try:
         node = yaml.compose(text.decode("utf-8-sig"), Loader=yaml.SafeLoader)
     except UnicodeDecodeError as error:
@@ -248,8 +253,10 @@ def _size(path: Path, top: _Mapping, key: str) -> int:
 
 
 def _numbers(path: Path, node: yaml.Node, what: str) -> tuple[Floats, yaml.Node]:
-    """Return the numbers of a node, and the node of the list that has them. node: a mapping {rows, cols, data}, a flat list
-    or a list of rows."""
+    """Return the numbers of a node, and the node of the list that contains these numbers.
+
+    node: a mapping {rows, cols, data}, a flat list or a list of rows.
+    """
     if isinstance(node, yaml.MappingNode):
         fields = _mapping(path, node, what)
         values, data = _numbers(path, _get(path, fields, "data", f"{what}.", node), f"{what}.data")

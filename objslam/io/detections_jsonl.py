@@ -18,7 +18,7 @@ from objslam.io.box_collector import BoxCollector
 from objslam.io.text import in_order, misspelt, read_lines, require_order
 
 MALFORMED = "detection frame malformed: "
-"""The begin of the reason to drop a frame that is malformed."""
+"""The first words of the reason in the ledger for each malformed frame."""
 _KEYS = frozenset(("stamp", "boxes", "labels", "scores", "depths", "track_ids", "corners", "features", "whole"))
 _EXAMPLE = 'a line is {"stamp": 12.5, "boxes": [[x1, y1, x2, y2]], "labels": ["cup"], "scores": [0.9]}'
 
@@ -30,12 +30,12 @@ class Malformed(ValueError):
 def read_detections(path: Path, ledger: Ledger) -> Detections:
     """Read a detections file. Boxes are in px of the raw image, timestamps in s, and depths z along the optical axis in m.
 
-    Malformed lines, frames out of time order and invalid boxes are dropped and counted. A key that is probably misspelt is a
-    warning. Raises LogError if no frame is left.
+    Malformed lines, frames out of time order and invalid boxes are dropped and counted. A key that is probably misspelt
+    gives a warning. Raises LogError if no line is a frame, or if most frames are out of time order.
     """
     collector = BoxCollector()
     lines = read_lines(path, ledger)
-    if lines and lines[0][1].strip() == "[":  # Else its last frame, which no comma follows, would be the whole log.
+    if lines and lines[0][1].strip() == "[":  # Only the last frame of a list is valid JSON, because no comma follows it.
         hint = "write one frame a line, without brackets around them and commas between them"
         raise LogError("the file is one JSON list", where=str(path), hint=hint)
     whole, reasons, keys = True, Counter[str](), set[str]()
@@ -88,7 +88,7 @@ def write_detections(detections: Detections, path: Path) -> None:
 
 
 def parse_object(text: str | bytes) -> dict[str, Any]:
-    """Return the JSON object of a line. Raises Malformed for other content."""
+    """Return the JSON object that a line contains. Raises Malformed for other content."""
     try:
         value = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -99,7 +99,7 @@ def parse_object(text: str | bytes) -> dict[str, Any]:
 
 
 def read_stamp(message: dict[str, Any]) -> float:
-    """Return the timestamp of a message, s. Raises Malformed if it is missing or no finite number."""
+    """Return the timestamp of a message, s. Raises Malformed if the timestamp is missing or not a finite number."""
     if "stamp" not in message:
         raise Malformed("stamp is missing")
     (stamp,) = read_numbers([message["stamp"]], "stamp")
@@ -109,10 +109,10 @@ def read_stamp(message: dict[str, Any]) -> float:
 
 
 def add_frame(frame: dict[str, Any], place: str, collector: BoxCollector) -> bool:
-    """Add a frame with its boxes. Return its key "whole": True if the image edge cuts no box off.
+    """Add a frame with its boxes to `collector`. Return the value of its key "whole", which is False if the key is missing.
 
-    A label may be an integer, as detectors number their classes. A box with another label that is no text is invalid.
-    Raises Malformed if the frame is invalid.
+    "whole" is True if the image edge cuts no box off. A label is text, or an integer, because detectors number their
+    classes. A box with another label is invalid. place: the file and line. Raises Malformed if the frame is invalid.
     """
     stamp = read_stamp(frame)
     boxes = _list(frame, "boxes")

@@ -10,17 +10,17 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 OLD = "old"
-"""In a temporary folder, the name of the folder that is being replaced."""
+"""The name of a folder inside a temporary folder. The folder that is being replaced has this name until the end."""
 
 
 @contextmanager
 def no_empty_folders(path: Path) -> Iterator[None]:
-    """If the block raises an error, delete those of `path` and its parent folders that the block created and left empty."""
+    """If the block raises an error, delete the empty folders that the block created, among `path` and its parents."""
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         yield
     except BaseException:
-        with suppress(OSError):  # A folder with content remains, and so do its parents.
+        with suppress(OSError):  # A folder with content remains. Its parents also remain.
             for folder in made:
                 if folder.exists():
                     folder.rmdir()
@@ -28,17 +28,19 @@ def no_empty_folders(path: Path) -> Iterator[None]:
 
 
 def temporary_name(path: Path) -> str:
-    """Return the name of a temporary file or folder beside `path`. It contains the machine and the process, so that
-    `remove_leftovers` knows whose it is. The process may also append a dot and more letters to this name."""
+    """Return the name of a temporary file or folder beside `path`. The name contains the machine and the process.
+
+    `remove_leftovers` finds the owner by this name. The process may append a dot and more letters to the name.
+    """
     return f".{path.name}.{_machine()}-{os.getpid()}"
 
 
 def remove_leftovers(path: Path) -> None:
-    """Delete the temporary files and folders beside `path` that dead processes of this machine left (`temporary_name`).
+    """Delete the temporary files and folders beside `path` that dead processes of this machine left.
 
-    A process that was killed while it replaced the folder `path` may have left the old folder in a temporary folder. If
-    nothing is at `path` now, the old folder is moved back first. Files of other machines stay, because their processes may
-    be alive. Raises OSError if the folder cannot be changed.
+    Their names are from `temporary_name`. A process that was killed while it replaced the folder `path` may have left the
+    old folder in a temporary folder. If nothing is at `path` now, the old folder is moved back first. Files of other
+    machines stay, because their processes may be alive. Raises OSError if the folder cannot be changed.
     """
     ours = re.compile(rf"\.{re.escape(path.name)}\.{_machine()}-([0-9]{{1,9}})(?:\..*)?", re.DOTALL)
     for entry in list(path.parent.iterdir()) if path.parent.is_dir() else []:
@@ -54,7 +56,7 @@ def remove_leftovers(path: Path) -> None:
 
 
 def _machine() -> str:
-    """Return a short mark of this machine or container. Process numbers have a meaning only on their own machine."""
+    """Return a short text that identifies this machine or container. A process number is valid only on its own machine."""
     return f"{zlib.crc32(platform.node().encode()):08x}"
 
 

@@ -12,10 +12,10 @@ from objslam.io.text import drop_rows, in_order, parse_numbers, read_lines
 
 
 def read_images(path: Path, ledger: Ledger) -> Images:
-    """Read an image list without opening the images. Raises LogError if no line is left.
+    """Return the timestamps (s) and paths of an image list, without opening the images. Raises LogError if no line is left.
 
-    A line is dropped and counted if it is malformed or out of time order, or if its file is missing, no regular file, or
-    outside the folder of the list.
+    A line is dropped and counted if it is malformed or out of time order. A line is also dropped if its image is missing,
+    not a regular file, or outside the folder of the list.
     """
     inside = Inside(path.parent)
     name = path.name

@@ -7,14 +7,16 @@ from collections.abc import Callable
 _STANDALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # The JPEG markers without a segment.
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # The JPEG markers of frame headers, which contain the size.
 _WIDTH_TAG, _HEIGHT_TAG = 256, 257
-_HEADER = 4096  # The most bytes of a Netpbm header that are read. Comments are the only long part of one.
+_HEADER = 4096  # The most bytes of a Netpbm header that are read. Only comments can make such a header long.
 _NUMBERS = re.compile(rb"P[1-6Ff](?:\s+|#[^\n]*\n)+([0-9]{1,9})(?:\s+|#[^\n]*\n)+([0-9]{1,9})\s")
 _TIFF_INTEGERS = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i", 16: "Q", 17: "q"}  # `struct` formats by TIFF field type.
 
 
 def stated_size(data: bytes) -> tuple[int, int] | None:
-    """Return the width and height, px, that an image file states in its header. Return None for an unknown format.
-    Raises ValueError if the header is damaged, or a PNG file is cut off."""
+    """Return the width and height, px, from the header of an image file, or None for an unknown format.
+
+    data: the content of the file. Raises ValueError if the header is damaged, or if a PNG file is cut off.
+    """
     for magic, read in _READERS.items():
         if data.startswith(magic):
             try:
@@ -30,8 +32,10 @@ def _pair(form: str, data: bytes, at: int) -> tuple[int, int]:
 
 
 def _png(data: bytes) -> tuple[int, int]:
-    """Return the size of a PNG. Check the stated lengths of all its chunks too, because OpenCV takes the memory for a stated
-    length before it finds that the file is shorter."""
+    """Return the size of a PNG. Raises ValueError if a chunk states a length beyond the end of the file.
+
+    OpenCV would take the memory for this length before it finds that the file is shorter.
+    """
     size, at, kind = _pair(">II", data, 16), 8, b""
     while kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", data, at)

@@ -1,8 +1,8 @@
 """Decode image files (PNG, JPEG, TIFF, ...) to pixels, except images that would take much memory or time.
 
-A file of some bytes can state a size of gigabytes. A JPEG file can have thousands of scans, each of which changes all
-pixels. The stated size and the number of scans are therefore checked before the image is decoded. A format whose header
-`stated_size` cannot read is not decoded.
+A file of a few bytes can state a size of gigabytes. A JPEG file can have thousands of scans, and each scan can change all
+pixels. The stated size and the number of scans are therefore checked before the image is decoded. An image is not decoded
+if `stated_size` does not know its format.
 """
 
 from typing import Any
@@ -13,23 +13,29 @@ from numpy.typing import NDArray
 from objslam.io.image_size import stated_size
 
 MAX_PIXELS = 1 << 26
-"""The most pixels of an image. A PNG with this number takes 3 s. A larger number takes more memory and time. No robot's
-camera has more."""
+"""The largest number of pixels of an image that is decoded. A larger number takes more memory and time. A PNG with this
+number of pixels takes 3 s. No robot's camera has more pixels."""
 _MAX_SCANNED = 1 << 29
-"""The largest product of the pixels and the scans of a JPEG. A larger number takes more time: 16 million pixels in 100 scans
-are three times this number, and took 4 s. A progressive JPEG has about ten scans."""
+"""The largest product of the number of pixels and the number of scans of a JPEG that is decoded. A larger product takes more
+time. 16 million pixels in 100 scans are three times this product, and took 4 s. A progressive JPEG has about ten scans."""
 _JPEG, _SCAN = b"\xff\xd8\xff", b"\xff\xda"  # The first bytes of a JPEG, and the marker before each scan.
 
 
 def decode_colour(data: bytes) -> NDArray[np.uint8] | None:
-    """Return the pixels (H, W, 3), uint8, BGR, of an image file, None if it cannot be decoded. EXIF rotation is ignored."""
+    """Return the pixels (H, W, 3), uint8, BGR, of an image file. Return None if the image is not decoded.
+
+    data: the content of the file. The rotation in the EXIF data is ignored.
+    """
     import cv2
 
     return _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
 def decode_depth(data: bytes) -> NDArray[Any] | None:
-    """Return the pixels (H, W) or (H, W, C) of a depth image in its own units and type, None if it cannot be decoded."""
+    """Return the pixels (H, W) or (H, W, C) of a depth image file, in the units and the type of the file.
+
+    data: the content of the file. Return None if the image is not decoded.
+    """
     import cv2
 
     return _decode(data, cv2.IMREAD_UNCHANGED)

@@ -20,8 +20,8 @@ from objslam.core.validity import MAX_POSITION, MAX_STAMP, covariance_fault, len
 from objslam.errors import LogError, ObjslamError, OutputError
 
 FORMAT = "objslam.objects/2"  # The value of the key "format", which is the file type and its version.
-_READ = ("objslam.objects/1", FORMAT)  # The formats that can be read. Format 1 lacks what came later.
-_UNIT = 1e-3  # The largest difference between the length of a direction and 1. A larger value accepts worse directions.
+_READ = ("objslam.objects/1", FORMAT)  # The formats that can be read. Format 1 lacks the keys that format 2 added.
+_UNIT = 1e-3  # The largest difference between the length of a unit vector and 1. A larger value accepts worse vectors.
 _T = TypeVar("_T")
 
 
@@ -30,8 +30,8 @@ class _Malformed(OutputError):
 
 
 def dump_objects(objects: ObjectMap) -> str:
-    """Return the text of objects.json for a map. `read_objects` restores every finite number exactly. Other numbers become
-    null."""
+    """Return the text of objects.json for a map. `read_objects` restores each finite number exactly. NaN and infinity
+    become null."""
     shared = objects.shared_covariance
     more = {} if shared is None else {"shared_covariance": shared.tolist()}
     return _dump([_entry(o) for o in objects.objects], objects.frame, [_entry(o) for o in objects.gone], more)
@@ -54,7 +54,7 @@ def _truth_entry(o: TruthObject) -> dict[str, Any]:
 
 
 def read_objects(file: Path) -> ObjectMap:
-    """Read the map of an objects.json. Raises OutputError with the file and the malformed object."""
+    """Return the map in an objects.json. Raises OutputError, which names the file and the malformed object."""
     try:
         return parse_objects(_load(file))
     except _Malformed as malformed:
@@ -62,7 +62,7 @@ def read_objects(file: Path) -> ObjectMap:
 
 
 def parse_objects(data: dict[str, Any]) -> ObjectMap:
-    """Return the map in the decoded JSON data of an objects.json. Raises OutputError if the data are malformed."""
+    """Return the map from the decoded JSON data of an objects.json. Raises OutputError if the data are malformed."""
     if data.get("format") not in _READ:
         raise _Malformed(f"format is {data.get('format')!r}, not {FORMAT!r}")
     gone = data.get("gone", [])
@@ -78,9 +78,9 @@ def parse_objects(data: dict[str, Any]) -> ObjectMap:
 
 
 def read_truth_objects(file: Path, error: type[ObjslamError] = LogError) -> tuple[TruthObject, ...]:
-    """Read a ground truth file, an objects.json in which each object has at least id, label and position (m, in map).
+    """Return the objects of a ground truth file. It is an objects.json with at least id, label and position (m, in map).
 
-    Unresolved objects in the map of a run are skipped. A malformed file raises `error` with the file and the object.
+    Objects with the status "unresolved" are skipped. A malformed file raises `error`, which names the file and the object.
     """
     try:
         data = _load(file)
@@ -92,7 +92,7 @@ def read_truth_objects(file: Path, error: type[ObjslamError] = LogError) -> tupl
 
 
 def _dump(entries: list[dict[str, Any]], frame: str, gone: list[dict[str, Any]], more: dict[str, Any]) -> str:
-    """Return the text of the file. Each object is on its own line, so that two files can be compared line by line."""
+    """Return the text of objects.json. Each object has its own line, so that two files can be compared line by line."""
     first = {"format": FORMAT, "frame": frame, **more}
     head = json.dumps(first, allow_nan=False)[:-1] + ', "objects": '
     return head + _lines(entries) + (f', "gone": {_lines(gone)}' if gone else "") + "}\n"

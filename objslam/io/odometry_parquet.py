@@ -1,4 +1,4 @@
-"""Read and write motions.parquet, the odometry between the poses of a result. Exports and other optimisers use it."""
+"""Read and write motions.parquet, the odometry between the poses of a result. Exports and other optimisers use this file."""
 
 import io
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ class Motions:
     before: Floats  # (M,) timestamp of the first pose, s.
     after: Floats  # (M,) timestamp of the second pose, s.
     motion: Floats  # (M, 4, 4) before_T_after.
-    covariance: Floats  # (M, 6, 6) of translation (m), then rotation (rad), in the base frame at `after`.
+    covariance: Floats  # (M, 6, 6) of the motion: translation (m), then rotation (rad), in the base frame at `after`.
 
 
 def dump_motions(motions: Motions) -> bytes:
-    """Return the content of motions.parquet, with one row per motion and matrices in row-major order."""
+    """Return the content of motions.parquet. Each motion is one row, and matrices are in row-major order."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -8,12 +8,12 @@ from objslam.core.result import Surface
 
 
 def write_mesh(surface: Surface, file: Path) -> None:
-    """Write vertices (m), colours and triangles. Raises OSError if the file cannot be written."""
+    """Write the vertices (m, in map), colours and triangles of a surface. Raises OSError if the file cannot be written."""
     _write(surface, file, triangles=True)
 
 
 def write_cloud(surface: Surface, file: Path) -> None:
-    """Write vertices (m), normals and colours without triangles. Raises OSError if the file cannot be written."""
+    """Write the vertices (m, in map), normals and colours of a surface. Raises OSError if the file cannot be written."""
     _write(surface, file, triangles=False)
 
 

@@ -30,8 +30,8 @@ _NUMBERS = {
     "sigma": 1,
 }
 _NUMBERS |= {"residual_before": 1, "image": 2, "speed": 1, "turn_rate": 1}  # How many numbers each column has in a row.
-_LATER = {"frame_stamp": "stamp"}  # A column that older files do not have, and the column that stands for it there.
-_UNIT = 1e-3  # The most that the length of a direction may differ from 1. A larger value accepts worse directions.
+_LATER = {"frame_stamp": "stamp"}  # The columns that older files do not have, and the column that is read instead.
+_UNIT = 1e-3  # The largest difference between the length of a direction and 1. A larger value accepts worse directions.
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,8 +50,8 @@ class RaysTable:
     box: Floats  # (R, 4) x1, y1, x2, y2, px of the raw image.
     label: Any  # (R,) label of the box.
     sigma: Floats  # (R,) standard deviation of the residual along one axis, from the settings, rad.
-    residual_before: Floats  # (R,) rad, residual before the correction of the shared errors, NaN without one.
-    image: Floats  # (R, 2) centre of the box, as a share of the image's width and height.
+    residual_before: Floats  # (R,) residual before the correction of the shared errors, rad. NaN without a correction.
+    image: Floats  # (R, 2) centre x, y of the box, as shares of the image's width and height.
     speed: Floats  # (R,) speed of the robot, m/s.
     turn_rate: Floats  # (R,) turn rate of the robot to the left, rad/s.
 
@@ -87,12 +87,15 @@ class RaysTable:
         )
 
     def to_pandas(self) -> "pd.DataFrame":
-        """Return the rays as a pandas data frame. ObjslamError if pandas is not installed."""
+        """Return the rays as a pandas data frame. Raises ObjslamError if pandas is not installed."""
         return to_pandas(self.to_arrow())
 
 
 def dump_rays(rays: RaysTable) -> bytes:
-    """Return the content of rays.parquet. Object -1 and NaN residuals become null. Raises OutputError for invalid text."""
+    """Return the content of rays.parquet. Object -1 and NaN residuals become null.
+
+    Raises OutputError for a label or a camera name that UTF-8 cannot represent.
+    """
     import pyarrow.parquet as pq
 
     for name in {*rays.label, *rays.camera}:
@@ -103,7 +106,7 @@ def dump_rays(rays: RaysTable) -> bytes:
 
 
 def read_rays(file: Path) -> RaysTable:
-    """Read a rays.parquet. Raises OutputError if the file is missing, damaged, from an older version or not from a run."""
+    """Read a rays.parquet. Raises OutputError if the file is missing or damaged, lacks a column, or has invalid values."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -129,7 +132,10 @@ def read_rays(file: Path) -> RaysTable:
 
 
 def _column(table: Any, name: str, size: int) -> Floats:
-    """Return a column of numbers (R,), or of lists of `size` numbers (R, size). An empty cell is NaN."""
+    """Return the numbers of a column, (R,) if `size` is 1, else (R, size). An empty cell of single numbers is NaN.
+
+    Raises ValueError if a row does not have `size` numbers.
+    """
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -151,7 +157,7 @@ def _texts(table: Any, name: str) -> Any:
 
 
 def _fault(rays: RaysTable) -> str | None:
-    """Return what is wrong with a ray, None if all are valid."""
+    """Return what is wrong with the first invalid column of rays, or None if all rays are valid."""
     boxes = box_rules(rays.box, rays.score, np.ones(len(rays), dtype=bool))
     angles = [np.isnan(angle) | ((angle >= 0) & (angle <= np.pi)) for angle in (rays.residual, rays.residual_before)]
     rates = np.column_stack([rays.speed, rays.turn_rate, rays.image])
@@ -170,14 +176,17 @@ def _fault(rays: RaysTable) -> str | None:
 
 @dataclass(frozen=True, eq=False)
 class RayFeatures:
-    """The appearance vectors of rays. ray: (V,) the row of each ray in rays.parquet, increasing. vectors: (V, D) unit."""
+    """The appearance vectors of rays.
+
+    ray: (V,) row of each ray in rays.parquet, increasing. vectors: (V, D) unit appearance vector of each ray.
+    """
 
     ray: Ints
     vectors: Floats32
 
 
 def dump_features(features: RayFeatures) -> bytes:
-    """Return the content of features.parquet, with one row per vector."""
+    """Return the content of features.parquet. Each vector is one row."""
     import pyarrow.parquet as pq
 
     buffer = io.BytesIO()

@@ -6,14 +6,14 @@ from pathlib import Path
 
 
 class Inside:
-    """The check that a file is a regular file inside a folder, after symbolic links are resolved."""
+    """A check that a path, after symbolic links are resolved, is a regular file inside a folder."""
 
     def __init__(self, folder: Path) -> None:
         self._root = os.path.realpath(folder)
         self._folders: dict[str, bool] = {}  # A cache, because the many files of a log are in few folders.
 
     def reason_against(self, path: Path) -> str | None:
-        """Return the reason to reject a path, None if the path is a regular file inside the folder."""
+        """Return the reason to reject a path, or None if the path is a regular file inside the folder."""
         folder = str(path.parent)
         if folder not in self._folders:
             self._folders[folder] = self._contains(folder)

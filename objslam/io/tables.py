@@ -1,4 +1,4 @@
-"""Tables for users: pyarrow always, pandas if it is installed."""
+"""Make tables for users. pyarrow tables are always possible. pandas data frames need an installed pandas."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def arrow_table(columns: Mapping[str, Any]) -> pa.Table:
 
 
 def to_pandas(table: pa.Table) -> pd.DataFrame:
-    """Return a pyarrow table as a pandas data frame. ObjslamError if pandas is not installed."""
+    """Return a pyarrow table as a pandas data frame. Raises ObjslamError if pandas is not installed."""
     try:
         import pandas  # noqa: F401
     except ModuleNotFoundError as error:

@@ -18,14 +18,15 @@ from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
 
 _IN_ORDER = 0.5
-"""The least share of the rows of a file that must be in the order of time. A file in another order has a far smaller share.
-A larger value also rejects files of a robot whose clock was set back."""
+"""The least share of the rows of a file that must be in the order of time. A smaller share in order is an error. A file in
+another order has a far smaller share. A larger value also rejects files of a robot whose clock was set back."""
 _PLACES = 3
-"""The most places (file:line) of dropped rows that the ledger gets for a reason. A larger number gives more examples."""
-_SHOWN = 80  # The most characters of a line that a message shows. A larger number makes the message longer.
+"""The largest number of dropped rows for one reason whose places (file:line) the ledger gets. A larger number gives more
+examples."""
+_SHOWN = 80  # The largest number of characters of a line that a message shows. A larger number makes the message longer.
 _CLOSE = 0.75
-"""The least similarity, from 0 to 1, of a name to the name that is meant. A larger number finds fewer misspelt names, and a
-smaller one takes names of other programs for misspelt ones."""
+"""The least similarity, from 0 to 1, of a misspelt name to the right name. A larger number finds fewer misspelt names. A
+smaller number takes names of other programs for misspelt names."""
 _MAX_UNPACKED = 1 << 30  # The largest size of an unpacked file, bytes. A day of poses at 200 Hz is smaller.
 
 
@@ -35,12 +36,12 @@ class Table:
 
     values: Floats  # (N, C), finite.
     lines: Ints  # (N,) line numbers, from 1.
-    rows: Ints  # (N,) row numbers, from 0. They also count dropped rows, so rows of several files can be matched by number.
+    rows: Ints  # (N,) row numbers, from 0. Dropped rows also have a number, so rows of several files match by number.
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Convert OSError to LogError with the name of the failing file, or `path` if the error has no file name."""
+    """Convert each OSError of the block to LogError. It names the failing file, or `path` if the error has no file name."""
     try:
         yield
     except OSError as error:
@@ -49,7 +50,7 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Return the content of a regular file, unpacked if its suffix is .gz. Raises LogError if the file is unreadable."""
+    """Return the content of a regular file. A file with the suffix .gz is unpacked. Raises LogError if this fails."""
     with reading(path):
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):
@@ -69,13 +70,15 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_lines(path: Path, ledger: Ledger) -> list[tuple[int, str]]:
-    """Return number (from 1) and stripped text of each line of a UTF-8 file, without empty lines and '#' comments."""
+    """Return the number (from 1) and the stripped text of each line of a UTF-8 file, without empty lines and '#' comments.
+
+    Lines that are not UTF-8 are dropped and counted. Raises LogError if the file is unreadable.
+    """
     return split_lines(read_bytes(path), str(path), ledger)
 
 
 def split_lines(data: bytes, place: str, ledger: Ledger) -> list[tuple[int, str]]:
-    """Split the bytes of a file as `read_lines` does. Lines that are not UTF-8 are dropped and counted. place: the file name
-    in the ledger."""
+    """Return the lines in the bytes of a file, as `read_lines` does. place: the file name in the ledger."""
     damaged = False
     try:
         text = data.decode("utf-8-sig")
@@ -93,17 +96,17 @@ def split_lines(data: bytes, place: str, ledger: Ledger) -> list[tuple[int, str]
 
 
 def read_table(path: Path, columns: int, ledger: Ledger, what: str) -> Table:
-    """Read a text file in which each line has `columns` numbers, separated by white space, as `to_table` does."""
+    """Return the table of a text file. Each line has `columns` numbers with white space between them. See `to_table`."""
     return to_table(read_lines(path, ledger), path, columns, ledger, what)
 
 
 def to_table(
     numbered: Sequence[tuple[int, str]], path: Path, columns: int, ledger: Ledger, what: str, form: str = ""
 ) -> Table:
-    """Return the table of lines from `read_lines` that have `columns` numbers each. Raises LogError if none is valid.
+    """Return the table of lines from `read_lines` that have `columns` numbers each. Raises LogError if no line is valid.
 
     Lines with another number of columns or a value that is not finite are dropped and counted. what: the name of a line in
-    messages, such as "pose". form: what a line contains, for the error. If it is empty, the error says `columns` numbers.
+    messages, such as "pose". form: what a line contains, for the error. If `form` is "", the error states `columns` numbers.
     """
     table = _clean_table(numbered, columns)
     if table is None:
@@ -126,8 +129,7 @@ def to_table(
 
 
 def _clean_table(numbered: Sequence[tuple[int, str]], columns: int) -> Table | None:
-    """Return the table if all lines have `columns` numbers, else None. This is three times as fast as reading line by
-    line."""
+    """Return the table if all lines have `columns` numbers, else None. This is three times as fast as a loop over lines."""
     lines = [text for _, text in numbered]
     whole = "".join(lines)
     if not lines or "_" in whole or not whole.isascii():
@@ -142,13 +144,13 @@ def _clean_table(numbered: Sequence[tuple[int, str]], columns: int) -> Table | N
 
 
 def select(table: Table, keep: Bools, reason: str, path: Path, ledger: Ledger) -> Table:
-    """Return the rows of a table that `keep` (N,) marks. Count the other rows as drops under `reason`."""
+    """Return the rows of a table where `keep` (N,) is True. The ledger counts the other rows as drops under `reason`."""
     count_drops(reason, int((~keep).sum()), (f"{path}:{line}" for line in table.lines[~keep]), ledger)
     return Table(table.values[keep], table.lines[keep], table.rows[keep])
 
 
 def count_drops(reason: str, count: int, places: Iterable[str], ledger: Ledger) -> None:
-    """Add `count` drops under `reason` to the ledger, with the first few of their `places` (file:line)."""
+    """Add `count` drops under `reason` to the ledger, with the first few places. places: file:line of each drop."""
     first = list(islice(places, min(count, _PLACES)))
     for place in first:
         ledger.drop(reason, where=place)
@@ -156,13 +158,13 @@ def count_drops(reason: str, count: int, places: Iterable[str], ledger: Ledger) 
 
 
 def drop_rows(reason: str, bad: Bools, places: Sequence[str], ledger: Ledger) -> None:
-    """Count the rows that `bad` (N,) marks as drops under `reason`. places: (N,) the place (file:line) of each row."""
+    """Count the rows where `bad` (N,) is True as drops under `reason`. places: the N places (file:line) of the rows."""
     rows = np.flatnonzero(bad).tolist()
     count_drops(reason, len(rows), (places[i] for i in rows), ledger)
 
 
 def parse_numbers(fields: list[str]) -> list[float] | None:
-    """Return the fields as numbers, None if one is invalid. Forms that only Python reads (1_000, non-ASCII) are invalid."""
+    """Return the fields as numbers, or None if a field is invalid. Forms such as 1_000 or non-ASCII digits are invalid."""
     try:
         numbers = [float(field) for field in fields]
     except ValueError:
@@ -172,7 +174,7 @@ def parse_numbers(fields: list[str]) -> list[float] | None:
 
 
 def require_order(forward: Bools, path: Path) -> None:
-    """Raise LogError if most rows of a file are not `in_order`. forward: (N,) the mask of the rows that are in order."""
+    """Raise LogError if most rows of a file are out of time order. forward: (N,) the mask of the rows in order."""
     if forward.mean() < _IN_ORDER:
         wrong = f"{int((~forward).sum())} of its {len(forward)} stamps repeat or go back"
         raise LogError(wrong, where=str(path), hint="sort the lines by their stamps")
@@ -182,8 +184,8 @@ def in_order(stamps: Floats, repeats: bool = False) -> Bools:
     """Return the mask (N,) of the timestamps (N,) that are later than all previous timestamps.
 
     If the clock jumps back, timestamps are rejected until they are later than the latest one before the jump. A single
-    timestamp far in the future is rejected instead of all that follow, if the next two continue from the one before it. With
-    `repeats`, a timestamp may equal the latest one.
+    timestamp too far in the future is rejected itself, if the next two timestamps are later than the one before it and
+    earlier than this one. The timestamps after it then stay. With `repeats`, a timestamp may equal the latest one.
     """
     before = np.concatenate([[-np.inf], stamps])[:-1]
     alone = np.zeros(len(stamps), dtype=bool)
@@ -193,10 +195,10 @@ def in_order(stamps: Floats, repeats: bool = False) -> Bools:
 
 
 def misspelt(given: Iterable[str], names: Collection[str]) -> dict[str, str]:
-    """Return the given names that are probably misspelt, with the name that is meant.
+    """Return the right name for each given name that is probably misspelt.
 
-    Nothing reads such a file, for example localisation.txt, or such a key. names: all names that are read. A name that is
-    given is not the meaning of another one.
+    given: names of files or keys. A misspelt one, for example localisation.txt, would not be read. names: all names that are
+    read. A right name that is itself in `given` is not returned for another name.
     """
     given = list(dict.fromkeys(given))
     absent = [name for name in names if name not in given]

@@ -9,15 +9,15 @@ from typing import TypeVar
 
 _In = TypeVar("_In")
 _Out = TypeVar("_Out")
-_THREADS = 2  # The number of threads. A single thread decodes PNG images more slowly than a GPU runs a network on them.
+_THREADS = 2  # The number of threads of `ahead`. One thread decodes PNG images more slowly than a GPU runs a detector.
 
 _ROOM = 16 << 20
-"""The memory that must be free for a thread to start, bytes. Its stack takes 8 MiB, and its first steps less than 32 kB. A
-larger number refuses to start a thread earlier."""
+"""The memory that must be free for a thread to start, bytes. The stack of a thread takes 8 MiB, and its first steps take
+less than 32 kB. With a larger number, a thread needs more free memory to start."""
 
 
 def start_thread(thread: threading.Thread) -> None:
-    """Start a thread. Raises OSError ENOMEM if too little memory is free.
+    """Start a thread. Raises OSError with the code ENOMEM if too little memory is free.
 
     If a new thread has a stack but no memory for its first steps, `threading.Thread.start` of Python 3.11 waits forever.
     """
@@ -26,7 +26,7 @@ def start_thread(thread: threading.Thread) -> None:
 
 
 def ahead(work: Callable[[_In], _Out], items: Iterable[_In], depth: int) -> Iterator[_Out]:
-    """Yield work(item) for each item in order. Threads compute up to `depth` results before the caller asks for them."""
+    """Yield work(item) for each item, in order. Threads compute up to `depth` results before the caller needs them."""
     waiting: deque[Future[_Out]] = deque()
     pool = ThreadPoolExecutor(_THREADS, thread_name_prefix="objslam-images")
     try:

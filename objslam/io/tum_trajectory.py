@@ -1,6 +1,6 @@
 """Trajectories in TUM format. Each line is "stamp tx ty tz qx qy qz qw" or a comment after '#'.
 
-Files with commas, with a header or with planar poses "stamp x y yaw" are read too.
+Files with commas, with a header or with planar poses "stamp x y yaw" can also be read.
 """
 
 from dataclasses import replace
@@ -27,22 +27,22 @@ _WORDS = {
     "theta": "yaw",
     "heading": "yaw",
 }
-"""Other names of columns that people write, with the name of `_COLUMNS` or `_PLANAR` for each. With more names, more files
-with another order of columns are refused."""
+"""Other names that people give to columns, each with its name in `_COLUMNS` or its place in a planar file. With more names,
+more files with another order of columns are refused."""
 
 
 def read_trajectory(path: Path, ledger: Ledger) -> Trajectory:
-    """Read a trajectory file, which may be packed (.gz). Timestamps are in s, translations in m, quaternions are x y z w, a
-    yaw is in rad. Commas may separate the numbers, and the first line may name the columns.
+    """Read a trajectory file, which may be packed (.gz). Timestamps are in s, translations in m, and a yaw in rad.
 
-    Malformed lines, invalid poses and poses out of time order are dropped and counted. Raises LogError if none is left,
-    if most are out of time order, or if the names of the columns are in another order.
+    Quaternions are x y z w. Commas may separate the numbers, and the first line may name the columns. Malformed lines,
+    invalid poses and poses out of time order are dropped and counted. Raises LogError if no pose is left, if most poses are
+    out of time order, or if the first line names the columns in another order.
     """
     return to_trajectory(read_pose_table(path, ledger))
 
 
 def read_pose_table(path: Path, ledger: Ledger) -> Table:
-    """Read a trajectory file as `read_trajectory` does, but return a table with its 8 columns."""
+    """Return the table of a trajectory file, with the 8 columns of the TUM format, as `read_trajectory` reads it."""
     table = _read_numbers(path, ledger)
     table = select(table, valid_stamps(table.values[:, 0]), "pose line with a stamp that is too large", path, ledger)
     table = select(
@@ -67,8 +67,8 @@ def read_pose_table(path: Path, ledger: Ledger) -> Table:
 
 
 def _read_numbers(path: Path, ledger: Ledger) -> Table:
-    """Return a table with 8 columns, also for a file with "stamp x y yaw". The first line with 8 or 4 numbers shows the form
-    of the file."""
+    """Return a table with 8 columns, also for a file with "stamp x y yaw". The first line with 8 or 4 numbers determines
+    which form the file has."""
     lines = [(number, text.replace(",", " ")) for number, text in read_lines(path, ledger)]
     names = lines[0][1].split() if lines else []
     if len(names) in (4, 8) and not any(parse_numbers([name]) for name in names):
@@ -87,10 +87,10 @@ def _read_numbers(path: Path, ledger: Ledger) -> Table:
 
 
 def _in_other_order(names: list[str]) -> bool:
-    """Return whether the 4 or 8 names of columns say that the columns are in another order than they should be.
+    """Return whether the 4 or 8 names of columns show that the columns are in a wrong order.
 
-    A known name must stand in its own place. Other names, such as "east", may stand anywhere. But the last of 8 names must
-    end with w.
+    A known name must be in its own place. Other names, such as "east", may be in any place. The last of 8 names must end
+    with w.
     """
     order = (_COLUMNS if len(names) == 8 else "stamp tx ty yaw").split()
     known = {*_COLUMNS.split(), *_PLANAR.split(), *_WORDS}

@@ -1,4 +1,4 @@
-"""Read and write views.parquet, the camera frames of a result: where each image was taken, also images without a box."""
+"""Read and write views.parquet, the camera poses of all images of a result, including images without a box."""
 
 import io
 from dataclasses import dataclass
@@ -16,15 +16,16 @@ from objslam.errors import LogError, OutputError
 from objslam.io.camera_yaml import dump_camera, parse_camera
 
 _CAMERAS, _MARGINS = b"objslam.cameras", b"objslam.margins"  # The keys of the cameras and the margins in the file's header.
-_BETWEEN = "\n---\n"  # The line between the texts of two cameras.
+_BETWEEN = "\n---\n"  # The line between the YAML texts of two cameras.
 
 
 @dataclass(frozen=True)
 class Views:
-    """F camera frames in the order of time. margin (px), margin_share: `rays.border` and `rays.border_share` of the run.
+    """F camera frames in the order of time.
 
     stamps: (F,) s, on the clock of the poses. frame_stamps: (F,) s, as in the log, before any correction of a clock. camera:
-    (F,) index into cameras. map_T_camera: (F, 4, 4).
+    (F,) index into `cameras`. map_T_camera: (F, 4, 4) pose of the camera. margin: the setting `rays.border` of the run, px.
+    margin_share: the setting `rays.border_share` of the run.
     """
 
     stamps: Floats
@@ -37,12 +38,12 @@ class Views:
 
     @classmethod
     def of(cls, frames: Keyframes, cameras: tuple[Camera, ...], margin: float, margin_share: float) -> Self:
-        """Return the views of frames at their poses."""
+        """Return the views of `frames`. The other arguments are attributes of the class."""
         return cls(frames.stamps, frames.frame_stamps, frames.camera, frames.map_T_camera, cameras, margin, margin_share)
 
 
 def dump_views(views: Views) -> bytes:
-    """Return the content of views.parquet, with one row per frame and the calibrations in its header."""
+    """Return the content of views.parquet. Each frame is one row, and the header has the calibrations and the margins."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

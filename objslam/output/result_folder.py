@@ -1,4 +1,4 @@
-"""The result folder: write its files, clear it, and replace an older result by a new one."""
+"""Write the files of a result folder, clear the folder, and replace an older result by a new one."""
 
 import json
 import shutil
@@ -34,13 +34,13 @@ from objslam.sources.journal.record_format import NAME
 from objslam.sources.log_folder import resembles_log
 
 RESULT_FILES = FileSet(files.SUMMARY, (*files.PARTS, *(known.file for known in FORMATS.values())), f"*.{files.DETECTIONS}")
-"""The files that a new result replaces or deletes. They include the exports of the older result."""
+"""The files that a new result replaces or deletes, including the exports of the older result."""
 _ALL_BUT_OBJECTS = replace(RESULT_FILES, others=tuple(name for name in RESULT_FILES.others if name != files.OBJECTS))
-"""The files of an older result that a live session deletes: all but objects.json, which it replaces."""
+"""The files of an older result that a live session deletes: all files except objects.json, which the session replaces."""
 
 
 def prepare_output(out: Path) -> None:
-    """Make the folder for a result and try to write there. Call this before a long computation.
+    """Make the folder for a result and write a test file to it. Call this function before a long computation.
 
     Raises:
         OutputError: the folder cannot be written, or the result would replace files that no run wrote: files of a log, files
@@ -64,8 +64,10 @@ def prepare_output(out: Path) -> None:
 
 
 def foreign_files(out: Path) -> list[str]:
-    """Return the names of the files and folders in a folder without a result, in order, without hidden ones. They would be
-    beside the files of a result."""
+    """Return the sorted names of the files and folders in `out` that are not files of a result, without hidden ones.
+
+    The list is empty if `out` already has a result. The files of a new result would be written beside these files.
+    """
     if not out.is_dir() or (out / files.SUMMARY).is_file() or (out / files.OBJECTS).is_file():
         return []
     return sorted({one.name for one in out.iterdir() if not one.name.startswith(".")} - set(RESULT_FILES.names(out)))
@@ -76,7 +78,7 @@ def output_folder(out: Path) -> Iterator[None]:
     """Call `prepare_output`, then run the `with` block. If the block fails, delete the new folder if it is empty.
 
     Raises:
-        OutputError: as `prepare_output`, or a live session writes into the folder.
+        OutputError: the errors of `prepare_output`, or a live session writes into the folder.
     """
     with no_empty_folders(out):
         refuse_session(out)
@@ -85,7 +87,7 @@ def output_folder(out: Path) -> Iterator[None]:
 
 
 def refuse_session(out: Path) -> None:
-    """Raise OutputError if a running session has its journal in the folder. Its result would replace a new one there."""
+    """Raise OutputError if a running session has its journal in `out`. Its result would replace a new result there."""
     file = out / NAME
     with disk_errors(out):
         if is_locked(file):
@@ -114,7 +116,10 @@ def write_result(
 
 
 def copy_result(folder: Path, out: Path) -> tuple[str, ...]:
-    """Copy the files of a result into the folder `out`. Replace, return and raise as `write_result` does."""
+    """Copy the files of the result in `folder` into `out`, and replace an older result there.
+
+    The returned names and the errors are those of `write_result`.
+    """
     prepare_output(out)
     found = [name for name in RESULT_FILES.names(folder) if (folder / name).is_file()]
     return replace_files(out, RESULT_FILES, {name: partial(shutil.copyfile, folder / name) for name in found})
@@ -124,7 +129,7 @@ def clear_result(out: Path) -> tuple[str, ...]:
     """Delete the files of an earlier run from the folder of a live session, and return their names.
 
     A remaining file would look like a file of the session. objects.json stays, because the session replaces it. If the
-    process is killed here, the next `prepare_output` deletes the rest. OutputError as in `write_result`.
+    process is killed here, the next `prepare_output` deletes the rest. Raises the same OutputError as `write_result`.
     """
     return replace_files(out, _ALL_BUT_OBJECTS, {})
 

@@ -19,14 +19,15 @@ from objslam.output.plot.changes_plot import draw_site
 from objslam.output.result_folder import RESULT_FILES, prepare_output
 
 _MOST_ISLANDS = 100
-"""Folders of an earlier merge are found up to island_100. With a larger number, more folders of a large merge are found."""
+"""The largest number of a folder island_N that is found from an earlier merge. With a larger number, more folders of a large
+merge are found."""
 
 
 def write_site(islands: Sequence[Island], names: Sequence[str], out: Path, warnings: Sequence[str] = ()) -> list[Path]:
     """Write the largest island into the folder `out`, the others into `out`/island_2 and so on. Return their folders.
 
-    names: the names of all sessions, in their order. warnings: each summary.json gets them. OutputError if a folder cannot
-    be written.
+    names: the names of all sessions, in their order. warnings: the texts that each summary.json gets. Raises OutputError if
+    a folder cannot be written.
     """
     folders = [out if number == 0 else out / f"island_{number + 1}" for number in range(len(islands))]
     for folder, island in zip(folders, islands, strict=True):
@@ -45,13 +46,13 @@ def write_site(islands: Sequence[Island], names: Sequence[str], out: Path, warni
 
 
 def islands_of_earlier_merges(out: Path, count: int) -> list[Path]:
-    """Return the folders of islands in `out` that a merge with this `count` of islands does not replace."""
+    """Return the folders of islands in `out` that a merge with `count` islands does not replace."""
     names = (f"island_{number + 1}" for number in range(count, _MOST_ISLANDS))
     return [out / name for name in names if (out / name / files.SUMMARY).is_file()]
 
 
 def summarise_site(island: Island, names: Sequence[str]) -> dict[str, Any]:
-    """Return what summary.json says of an island: its counts, and how each session lies in the frame of the first."""
+    """Return the content of summary.json for an island: counts, and the pose of each session in the first one's frame."""
     objects = island.objects
     sigma = np.sqrt(np.diagonal(island.covariance, axis1=1, axis2=2)) * [1, 1, 1, np.degrees(1)]
     planar = split_se2(island.site_T_session)[0]

@@ -23,8 +23,8 @@ TRACK_PATIENCE = 1.0  # The time without a box after which a tracker loses an ob
 class Views:
     """The M views of objects in all images of a camera, without errors.
 
-    frame: (M,) the index of the image. object: (M,) the index of the object. centre, size: (M, 2) of the box, px.
-    depth: (M,) z, m.
+    frame: (M,) the index of the image. object: (M,) the index of the object. centre, size: (M, 2) centre and size of the
+    box, px. depth: (M,) z, m.
     """
 
     frame: Ints
@@ -78,15 +78,15 @@ def views(settings: DriveSettings, camera: Camera, map_T_camera: Floats, points:
 
 
 def _reach(settings: DriveSettings, size: Floats) -> Floats:
-    """Return how far (M, 2), px, the centre of a box must be from the image's edges. size: (M, 2) of the boxes, px."""
+    """Return the least distance (M, 2), px, of box centres from the image's edges. size: (M, 2) sizes of the boxes, px."""
     return np.zeros_like(size) if settings.cut_off else size / 2
 
 
 def detect(
     settings: DriveSettings, camera: Camera, seen: Views, label: Ints, seed: np.random.SeedSequence, first_id: int = 0
 ) -> Boxes:
-    """Make boxes of visible objects, with noise and misses. label: (N,) the label of each object, as an index into the
-    classes. first_id: the id of object 0."""
+    """Return the boxes of visible objects, with noise and missed objects. label: (N,) the label of each object, as an index
+    into the classes. first_id: the id of object 0."""
     noise, miss, score, depth = (np.random.default_rng(s) for s in seed.spawn(4))
     count = len(seen.frame)
     centre = seen.centre + settings.pixel_sigma * noise.standard_normal((count, 2))
@@ -113,7 +113,7 @@ def imagine(settings: DriveSettings, camera: Camera, classes: int, seed: np.rand
 
 
 def _of_surfaces(settings: DriveSettings, camera: Camera, seen: Views) -> Floats:
-    """Return the depths (M,) z, m, of the visible surfaces of objects, where depths end."""
+    """Return the depths (M,) z, m, of the visible surfaces of objects. A camera measures these depths."""
     direction, _ = undistort(camera, seen.centre)
     box = np.concatenate([seen.centre - seen.size / 2, seen.centre + seen.size / 2], axis=1)
     share = 0.0 if settings.depth is None else settings.depth.surface
@@ -143,8 +143,8 @@ def detections(settings: DriveSettings, boxes: Boxes, frame_stamps: Floats, clas
 
 
 def with_features(cameras: list[Detections], objects: list[Ints], noise: AppearanceNoise, seed: int) -> list[Detections]:
-    """Return the detections of all cameras with appearance vectors. objects: the ids (M,) of the objects in their boxes, -1
-    for a false box, which has a vector of its own."""
+    """Return the detections of all cameras with appearance vectors. objects: for each camera, the ids (M,) of the objects in
+    its boxes, -1 for a false box. Each false box has its own vector."""
     rng = np.random.default_rng(seed)
     label, whose = np.concatenate([one.label for one in cameras]), np.concatenate(objects)
     whose = np.where(whose < 0, whose.max(initial=-1) + 1 + np.arange(len(whose)), whose)
@@ -167,8 +167,8 @@ def _scale(prototype: Floats, kind: Ints, standing: Bools, whose: Ints, error: F
 
     With this factor, the vectors of a share `confusion` of the boxes are nearer to another object of the same label.
 
-    prototype: (N, D) the vectors of objects. kind, standing: (N,) their labels, and which have more than one box. whose:
-    (M,) the object of each box.
+    prototype: (N, D) the vectors of the objects. kind: (N,) the labels of the objects. standing: (N,) which objects have
+    more than one box. whose: (M,) the object of each box.
     """
     low, high = 0.0, _MOST_NOISE
     for _ in range(_HALVINGS):

@@ -28,7 +28,7 @@ class Cast:
     """The surfaces that the rays of an image hit, one ray for each pixel.
 
     depth: (H, W) z, m, inf without a hit. part: (H, W) the index of the part in the room, -1 without a hit.
-    normal: (H, W, 3) of the surface, in map. point: (H, W, 3) that is hit, in map, m.
+    normal: (H, W, 3) normal of the surface, in map. point: (H, W, 3) point that the ray hits, in map, m.
     """
 
     depth: Reals

@@ -30,8 +30,8 @@ TRUTH_BOXES = "boxes.jsonl"
 """The name of the file of true boxes, which is in the groundtruth folder. It has the format of detections.jsonl."""
 ROUNDS = 40  # The largest number of random rooms that are tried. With a larger value, more settings find a good room.
 LOOK_AHEAD = 4
-"""When a room is tried, the width and the height of the images are divided by this factor. A larger factor is faster and
-judges views less exactly."""
+"""The factor by which the width and the height of the images are divided when a room is tried. With a larger factor, the
+trial is faster and less exact."""
 
 
 class BoxLimits(Section):

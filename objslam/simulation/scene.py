@@ -25,9 +25,9 @@ OTHER_EXTENT = (0.2, 0.2)  # The width and height of objects of other classes, m
 WALL = 0.3  # The least distance of random objects from the walls, m.
 CLEARANCE = 0.4  # The least horizontal distance of random objects from the path, m.
 CHECKED_FRAMES = 500
-"""The largest number of images of each camera in which a new object is looked for, to see whether its position is good. They
-are evenly spaced."""
-ROUNDS = 50  # The most sets of random positions that are drawn. With a larger value, positions are found for more objects.
+"""The largest number of images of each camera in which the position of a new object is tested. These images are evenly
+spaced."""
+ROUNDS = 50  # The most sets of random positions that are drawn. With more sets, positions are found for more objects.
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def _bounds(settings: DriveSettings) -> tuple[Floats, Floats]:
 
 
 def _places(settings: DriveSettings, path: Path, frame_stamps: Floats, extent: Floats, rng: np.random.Generator) -> Floats:
-    """Draw good positions (N, 3) in map, m, at least `min_distance` apart. extent: (N, 2) of the objects, m."""
+    """Return random good positions (N, 3) in map, m, at least `min_distance` apart. extent: (N, 2) sizes of objects, m."""
     places = np.zeros((0, 3))
     for _ in range(ROUNDS):
         if len(places) == settings.objects:
@@ -117,7 +117,7 @@ def _places(settings: DriveSettings, path: Path, frame_stamps: Floats, extent: F
 
 
 def _good(settings: DriveSettings, path: Path, frame_stamps: Floats, places: Floats, extent: Floats) -> Bools:
-    """Return which positions (P, 3) are off the path, and are seen in enough images and with enough parallax."""
+    """Return a mask (P,) of the positions (P, 3) away from the path that enough images see with enough parallax."""
     way = path.at(START + np.linspace(0.0, path.lap, 1000))[:, :2]
     free = cKDTree(way).query(places[:, :2])[0] >= CLEARANCE
     checked = np.linspace(0, settings.frames - 1, min(settings.frames, CHECKED_FRAMES)).astype(int)

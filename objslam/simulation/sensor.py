@@ -29,7 +29,7 @@ class Sensor(Section):
     depth_sigma_per_m2: NotNegative = 0.002
     """The part of the depth noise that grows with the square of the depth, m per m^2."""
     depth_missing: Probability = 0.01
-    """The share of pixels, drawn at random, that get no depth. Pixels at depth edges and steep surfaces never get one."""
+    """The share of random pixels that get no depth. Pixels at depth edges and on steep surfaces never get a depth."""
     depth_range: tuple[Positive, Positive] = (0.3, 6.0)  # The least and largest measured depth, m.
 
 

@@ -40,7 +40,7 @@ def make_camera(
 
 
 class PoseNoise(Section):
-    """The standard deviations of a planar pose or of a step between two poses. xy: along x and along y, m. yaw: in rad."""
+    """The standard deviations of a planar pose, or of a step between two poses. xy: along x and y each, m. yaw: rad."""
 
     xy: NotNegative = 0.0
     yaw: NotNegative = 0.0
@@ -53,7 +53,7 @@ class DepthNoise(Section):
     sigma_per_m: NotNegative = 0.02  # The part of the standard deviation that grows with the depth, m per m.
     missing: Probability = 0.0  # The share of boxes whose depth is missing (NaN).
     wrong: Probability = 0.0  # The share of boxes with a wrong depth, which is random from 0.3 m to max_range.
-    surface: NotNegative = 0.5  # How far the surface is before the centre of an object, as a share of half its width.
+    surface: NotNegative = 0.5  # The distance from an object's surface to its centre, as a share of half its width.
 
 
 class AppearanceNoise(Section):
@@ -84,8 +84,8 @@ class CourseSettings(Section):
     frame_rate: Positive = 5.0  # The number of images of each camera per second, Hz.
     laps: Positive | None = None  # The number of laps in the whole drive, which determines the speed.
     odometry: config.Odometry | PoseNoise | None = PoseNoise()
-    """The drift. config.Odometry: noise by distance and turn, without its floors. PoseNoise: noise in the time between two
-    images. None: no odometry."""
+    """The noise of the odometry. config.Odometry: noise that grows with distance and turn, without its floors. PoseNoise:
+    noise for the time between two images. None: no odometry."""
     localization: PoseNoise | None = PoseNoise()  # The error of each localised pose. None: no localisation.
 
 

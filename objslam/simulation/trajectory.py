@@ -13,7 +13,7 @@ from objslam.simulation.settings import DriveSettings, PoseNoise
 
 START = 1_700_000_000.0  # The stamp of the start of every drive, s.
 WHEEL_OFFSET = 0.5
-"""A wheel at this distance (m) from the robot's centre moves at constant speed. A larger value makes bends slower."""
+"""The distance (m) from the robot's centre of a wheel that moves at constant speed. A larger value makes bends slower."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Read recordings of any kind into a `Log`.
 
-`SOURCES` lists the kinds, each with the functions that detect and read it.
+`SOURCES` lists the kinds of recordings. Each entry names the functions that detect and read its kind.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SourceOptions(BagOptions, TumOptions, MrclamOptions, AnyOptions):
-    """The options of all sources. `--help` shows the options of the last base class first."""
+    """The options of all kinds of recordings. `--help` shows the options of the last base class first."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class Source:
     """A kind of recording.
 
     name: the value of `--format` that selects this kind. looks_for: the files that identify this kind, for error messages.
-    detector: "module:function" that takes a path and returns whether the path is of this kind.
-    reader: "module:function" that takes (path, ledger), and also the options if the kind has any.
+    detector: "module:function" of a function that takes a path and returns whether the path is of this kind.
+    reader: "module:function" of a function that takes (path, ledger), or (path, ledger, options) if the kind has options.
     options: the class of the kind's options, a base class of `SourceOptions`. None if the kind has no options.
-    marks: names of files and folders. A fleet takes a folder with any of them for a recording of this kind. A kind that is
-    a single file has none.
+    marks: names of files and folders. A fleet takes a folder with any of them for a recording of this kind. The tuple is
+    empty for a kind that is a single file.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Source:
         return resolve_name(f"objslam.{self.detector}")(path)
 
     def reads(self, path: Path, ledger: Ledger, options: SourceOptions) -> Log:
-        """Read a recording of this kind into a `Log`. Raises LogError if it cannot be read."""
+        """Return the `Log` of a recording of this kind. Raises LogError if the recording cannot be read."""
         more = () if self.options is None else (options,)
         return resolve_name(f"objslam.{self.reader}")(path, ledger, *more)
 
@@ -108,10 +108,10 @@ SOURCES = (
 
 
 def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Log:
-    """Read a recording of any kind in `SOURCES`.
+    """Return the log of a recording of any kind in `SOURCES`.
 
-    The content of the recording determines its kind, unless `options.format` names the kind. The ledger counts dropped data,
-    and gets a warning for each given option that this kind does not take.
+    The content of the recording determines its kind, unless `options.format` names the kind. The ledger counts dropped data.
+    The ledger also gets a warning for each option that is set but has no meaning for this kind.
     Raises LogError if no kind fits or the recording cannot be read, and ConfigError if `options.format` is unknown.
     """
     options = options or SourceOptions()
@@ -133,9 +133,10 @@ def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Lo
 def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, overwrite: bool = False) -> None:
     """Read a recording of any kind and write it as a log folder, including colour and depth images.
 
-    Images inside a bag are extracted into a temporary folder beside the log folder, unless `options.extract` names another
-    folder. They are then linked into the log folder, so that their bytes are written only once. If the recording has
-    neither images nor boxes, the rest is written with a warning: the robot's path, and the cameras, or their poses in tf.
+    source: the recording. log: the log folder. Images inside a bag are extracted into a temporary folder beside the log
+    folder, unless `options.extract` names another folder. The images are then linked into the log folder, so that their
+    bytes are written only once. If the recording has neither images nor boxes, the function warns. It then writes only the
+    robot's path, and the cameras. If no camera is known, the poses of the optical frames in tf are written.
     Raises the errors of `read` and `log_folder.write_log_folder`.
     """
     from objslam.sources import log_folder

@@ -5,13 +5,16 @@ import numpy as np
 from objslam.core.camera import Camera, spoken_name, undistort
 
 _SECTORS = ("ahead", "ahead and left", "left", "behind and left", "behind", "behind and right", "right", "ahead and right")
-_STEEP = 60.0  # From this elevation, degrees, a camera "looks up" or "looks down". With a larger value, fewer do.
-_LEVEL = 5.0  # The text omits an elevation or a tilt of at most this, degrees. A larger value omits more of them.
-_ASPECT = 1.2  # A camera is reported if fx / fy or fy / fx exceeds this. Real lenses are below 1.1. More reports fewer.
+_STEEP = 60.0  # The least elevation, degrees, of a camera that "looks up" or "looks down". With a larger value, fewer do.
+_LEVEL = 5.0  # The largest elevation or tilt, degrees, that the text omits. A larger value omits more angles.
+_ASPECT = 1.2  # The largest fx / fy or fy / fx without a doubt. Real lenses are below 1.1. A larger value: fewer doubts.
 
 
 def view_of(camera: Camera) -> str:
-    """Describe a camera's direction, tilt, height and angle of view: "looks ahead, 0.30 m above base, 70 degrees wide"."""
+    """Return a text on a camera's direction, tilt, height and angle of view.
+
+    An example is "looks ahead, 0.30 m above base, 70 degrees wide".
+    """
     right, down, forward = camera.base_T_camera[:3, :3].T
     height = float(camera.base_T_camera[2, 3])
     parts = [] if _has_no_rotation(camera) else [f"looks {_direction(forward)}"]
@@ -41,13 +44,13 @@ def doubts_of(camera: Camera) -> list[str]:
 
 
 def _has_no_rotation(camera: Camera) -> bool:
-    """Return whether base_T_camera has no rotation. On a robot, nobody has set it then, and it says nothing about the
-    direction of the camera."""
+    """Return whether base_T_camera has no rotation. On a robot, this means that nobody has set the rotation. The direction
+    of the camera is then unknown."""
     return np.allclose(camera.base_T_camera[:3, :3], np.eye(3), atol=1e-6)
 
 
 def _direction(forward: np.ndarray) -> str:
-    """Return in words where a unit vector (3,) in base points."""
+    """Return the direction of the unit vector `forward` (3,), in base, in words."""
     up = float(np.degrees(np.arcsin(np.clip(forward[2], -1, 1))))
     if abs(up) >= _STEEP:
         return "up" if up > 0 else "down"

@@ -1,4 +1,4 @@
-"""Read and write log folders, the format on disk that holds everything in a `Log`."""
+"""Read and write log folders. This format on disk contains all data of a `Log`."""
 
 import os
 import shutil
@@ -28,30 +28,30 @@ MOUNTS = "mounts.yaml"  # The file of base_T_camera from tf, for a recording who
 RGB, DEPTH, DETECTIONS = "rgb", "depth", "detections.jsonl"
 _FILES = (CAMERA, MOUNT, ODOMETRY, LOCALIZATION, f"{RGB}.txt", f"{DEPTH}.txt", DETECTIONS)
 _TEXT = (".txt", ".yaml", ".yml", ".json", ".jsonl", ".csv", ".gz")
-"""The suffixes of the files whose names are compared with those of a log."""
+"""The suffixes of the files in a folder whose names are checked for misspelt names of log files."""
 TRUTH, TRUTH_OBJECTS, TRUTH_TRAJECTORY = "groundtruth", "objects.json", "trajectory.txt"
 
 _T = TypeVar("_T")
 
 
 def is_log_folder(path: Path) -> bool:
-    """Return whether the folder holds a camera and a path of the robot (odometry or localisation), as log folders do."""
+    """Return whether the folder contains a camera and a path of the robot (odometry or localisation)."""
     camera = (path / CAMERA).is_file() or (path / CAMERAS).is_dir()
     return camera and ((path / ODOMETRY).is_file() or (path / LOCALIZATION).is_file())
 
 
 def resembles_log(path: Path) -> bool:
-    """Return whether the folder holds a camera or a path of the robot (odometry or localisation)."""
+    """Return whether the folder contains a camera or a path of the robot (odometry or localisation)."""
     return any((path / name).exists() for name in (CAMERA, CAMERAS, ODOMETRY, LOCALIZATION))
 
 
 def read_log_folder(path: Path, ledger: Ledger) -> Log:
-    """Read a log folder.
+    """Return the log in a log folder.
 
     Malformed lines are dropped, and counted with their file and line. Unusable lists of images and unusable ground truth are
     left out with a warning. If only one of odometry and localisation is usable, the other is left out with a warning. A file
-    whose name is probably misspelt is a warning. Images are not opened. Raises LogError if a camera, its detections or its
-    mount is unusable, or if no path is usable.
+    whose name is probably misspelt gives a warning. Images are not opened. Raises LogError if a camera, its detections or
+    its mount is unusable, or if neither odometry nor localisation is usable.
     """
     with reading(path):
         if not path.is_dir():
@@ -63,20 +63,23 @@ def read_log_folder(path: Path, ledger: Ledger) -> Log:
 
 
 def read_truth(folder: Path, ledger: Ledger) -> Truth | None:
-    """Read the ground truth in a folder. Unreadable files are left out with a warning. Returns None if nothing is left."""
+    """Return the ground truth in a folder, or None if the folder has no usable ground truth.
+
+    Unreadable files are left out with a warning.
+    """
     objects = _optional(read_truth_objects, folder / TRUTH_OBJECTS, ledger)
     trajectory = _optional(lambda file: read_trajectory(file, ledger), folder / TRUTH_TRAJECTORY, ledger)
     return None if objects is None and trajectory is None else Truth(objects or (), trajectory)
 
 
 def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
-    """Write a log folder. Every number reads back as the same float. Rotations are written as unit quaternions.
+    """Write a log folder. Every number is read back as the same float. Rotations are written as unit quaternions.
 
     The content is written into a temporary folder that is renamed at the end. Images are linked or copied into rgb/ and
     depth/. If all images of a stream are already in the camera's folder, they keep their relative paths. Detections without
-    frames are not written. Raises OutputError if the log has no cameras, if it has neither odometry nor localisation, if the
-    names of several cameras repeat or cannot be folder names, if a file cannot be written, or if `check_target` refuses the
-    path.
+    frames are not written. Raises OutputError if the log has no cameras, or has neither odometry nor localisation. The error
+    is also raised if the names of several cameras repeat or cannot be folder names, if a file cannot be written, or if
+    `check_target` refuses the path.
     """
     path = Path(os.path.realpath(path))
     if not log.cameras or log.robot_path is None:
@@ -90,9 +93,9 @@ def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
 
 
 def write_path(found: NoCamera, path: Path, *, overwrite: bool = False) -> tuple[str, ...]:
-    """Write the path and the cameras of a recording without images and boxes, and return the names of the files.
+    """Write the robot's path and the cameras of a recording without images and boxes. Return the names of the files.
 
-    A detections.jsonl beside each camera.yaml makes the folder a log. If no camera is known, the mounts are written instead.
+    With a detections.jsonl beside each camera.yaml, the folder is a log. If no camera is known, `MOUNTS` is written instead.
     Raises OutputError if a file cannot be written, or if `check_target` refuses the path.
     """
     paths = {ODOMETRY: found.odometry, LOCALIZATION: found.localization}
@@ -112,7 +115,7 @@ def write_path(found: NoCamera, path: Path, *, overwrite: bool = False) -> tuple
 
 
 def _write_whole(path: Path, overwrite: bool, write: Callable[[Path], None]) -> None:
-    """Make the folder at `path` with the files that `write` writes into it. It is made whole or not at all."""
+    """Make the folder `path` with the files that `write` writes. After an error, `path` is as it was before."""
     check_target(path, overwrite)
     with beside(path) as work, _writing(path):
         fresh = work / "new"
@@ -129,7 +132,7 @@ def _write_whole(path: Path, overwrite: bool, write: Callable[[Path], None]) -> 
 
 @contextmanager
 def beside(path: Path) -> Iterator[Path]:
-    """Make an empty folder in the parent folder of a path, and remove it at the end. It is on the same disk as the path."""
+    """Yield an empty folder in the parent folder of `path`, on the same disk, and remove the empty folder at the end."""
     path = Path(os.path.realpath(path))
     with no_empty_folders(path.parent):
         with _writing(path):
@@ -142,9 +145,10 @@ def beside(path: Path) -> Iterator[Path]:
 
 
 def check_target(path: Path, overwrite: bool) -> None:
-    """Raise OutputError if `path` is something that a log folder must not replace. An empty folder may be replaced.
+    """Raise OutputError if a log folder must not replace `path`. It may replace an empty folder, and with `overwrite` a log.
 
-    The remains of killed processes beside `path` are removed first. A log that a killed process was replacing is put back.
+    The files that killed processes left beside `path` are removed first. A log that a killed process was replacing is put
+    back.
     """
     with _writing(path):
         remove_leftovers(Path(os.path.realpath(path)))
@@ -152,7 +156,7 @@ def check_target(path: Path, overwrite: bool) -> None:
             raise OutputError("a file is in the way", where=str(path), hint="name another folder")
         if not path.exists() or not any(path.iterdir()):
             return
-        # If a recording has no camera, a conversion writes no more than its path.
+        # The conversion of a recording without a camera writes only its odometry and localisation.
         if not any((path / name).is_file() for name in (ODOMETRY, LOCALIZATION)):
             raise OutputError("the folder has files but is not a log", where=str(path), hint="name a new or empty folder")
         if not overwrite:
@@ -197,7 +201,7 @@ def _read_camera_log(folder: Path, name: str | None, ledger: Ledger) -> CameraLo
 
 
 def _check_names(folder: Path, ledger: Ledger) -> None:
-    """Warn of files whose names are probably misspelt. A folder may also hold a hundred thousand images, which are none."""
+    """Warn of files whose names are probably misspelt. Images are left out, because a folder may contain 100,000 images."""
     files = [file for file in folder.iterdir() if file.suffix.lower() in _TEXT and file.is_file()]
     for name, meant in misspelt(sorted(file.name for file in files), _FILES).items():
         ledger.warn(f"{folder / name}: no file of a log has this name, so it is not read (did you mean {meant}?)")
@@ -234,7 +238,7 @@ def _optional(read: Callable[[Path], _T], file: Path, ledger: Ledger) -> _T | No
 
 
 def _place(camera_log: CameraLog, cameras: tuple[CameraLog, ...]) -> Path:
-    """Return the folder of one of the cameras of a log, in the folder of the log."""
+    """Return the folder of a camera, relative to the folder of the log."""
     return Path() if len(cameras) == 1 else Path(CAMERAS, camera_log.camera.name)
 
 
@@ -267,7 +271,7 @@ def _write_content(log: Log, folder: Path, final: Path) -> None:
 
 
 def _link_images(images: Images, kind: str, folder: Path, final: Path) -> Images:
-    """Link or copy images into `folder`, and return them with their new paths. `folder` is renamed to `final` later."""
+    """Link or copy images into `folder`, and return them with their new paths. `folder` is later renamed to `final`."""
     sources = [path.resolve() for path in images.paths]
     distinct = list(dict.fromkeys(sources))
     names = [source.name for source in distinct]

@@ -1,4 +1,4 @@
-"""The error for a recording that has a path of the robot, but neither images nor boxes. It carries the rest of a log."""
+"""The error for a recording with a path of the robot, but without images and boxes. The error contains the usable data."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 class NoCamera(LogError):
-    """A recording without images and boxes.
+    """The recording has no images and no boxes.
 
-    cameras: the cameras that are known all the same, by a CameraInfo or from a file. mounts: base_T_camera (4, 4) from tf,
-    by the name of the optical frame.
+    odometry, localization: the robot's paths, None if unknown. cameras: the cameras that are known from a CameraInfo or from
+    a file. mounts: maps the name of each optical frame to its base_T_camera (4, 4) from tf.
     """
 
     def __init__(

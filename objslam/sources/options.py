@@ -1,7 +1,7 @@
 """The declaration of command line options by sources, and the options that several sources share.
 
-Each source declares its options as the fields of a frozen dataclass. `--help` imports every file that declares options, so
-such a file imports nothing heavy at its top, not even numpy.
+Each source declares its options as the fields of a frozen dataclass. `--help` imports every file that declares options. Such
+a file must therefore not import slow packages at its top, not even numpy.
 """
 
 from collections.abc import Collection
@@ -13,9 +13,9 @@ from typing import Annotated, Any, get_type_hints
 class Option:
     """The command line option of a field, as in `stride: Annotated[int, Option("--stride", "Every Nth frame.")] = 1`.
 
-    A field without an Option can be set from Python only. The option of a tuple field may be given several times.
-    flag: the option's name. "--rectified/--raw" names the true and the false value of a bool. A single name for a bool sets
-    the opposite of the default. help: the text in `--help`. metavar: the name of the value in `--help`.
+    A field without an Option can only be set from Python. The option of a tuple field may be given several times.
+    flag: the option's name. For a bool, "--rectified/--raw" names the options for True and False. A single name for a bool
+    sets the opposite of the default. help: the text in `--help`. metavar: the name of the value in `--help`.
     """
 
     flag: str
@@ -34,15 +34,17 @@ NAMES = Option(
     "Names of classes that a log or a model only numbers: coco, coco91, or a file (a name in each line, or YAML or JSON).",
     metavar="FILE|coco",
 )
-"""The option with the names of numbered classes, of all recordings, adapters and detectors."""
+"""The option that gives the names of numbered classes. All recordings, adapters and detectors have this option."""
 _KINDS = "Kind of the recording, such as ros or mrclam. A wrong name lists all. [default: found from its content]"
 
 
 @dataclass(frozen=True)
 class AnyOptions:
-    """The options of every source. format: the name of the source. None chooses the source by the recording's content.
-    class_names: the names for labels that are numbers, as `frontend.class_names.load_names` takes them. None keeps the
-    numbers. begin, end: the stamps, s, between which the recording is used. None for no limit.
+    """The options of every source.
+
+    format: the name of the source. With None, the content of the recording determines the source. class_names: the names for
+    labels that are numbers, as an argument of `frontend.class_names.load_names`. None keeps the numbers. begin, end: the
+    first and the last stamp of the recording that are used, s. None sets no limit.
     """
 
     format: Annotated[str | None, Option("--format", _KINDS)] = None
@@ -52,7 +54,7 @@ class AnyOptions:
 
 
 def names(*kinds: type[Any] | None) -> frozenset[str]:
-    """Return the field names of option classes."""
+    """Return the names of all fields of the option classes `kinds`. None among the classes is ignored."""
     return frozenset(field.name for kind in kinds if kind is not None for field in fields(kind))
 
 
@@ -67,7 +69,7 @@ def unused(options: Any, kind: type[Any], taken: Collection[str]) -> list[str]:
     """Return the flags of the options that are set but not used.
 
     options: an instance of the class `kind`. taken: the names of the fields that are used. An option is set if its value is
-    not the default. A field without an Option has its name as flag.
+    not the default. For a field without an Option, the flag is made from the field's name.
     """
     called = {name: option.flag.partition("/")[0] for name, (_, option) in flags(kind).items()}
     return [

@@ -16,13 +16,13 @@ FIND_BOXES = "run a detector on its images (--detector)"  # The advice for a cam
 
 
 _STEP = 10.0
-"""The least length of a chord of a path, in sigmas of the noise of its positions. At 10, noise makes a path 1 % longer. A
-larger value cuts more corners."""
+"""The least length of a chord of a path, as a multiple of the standard deviation of the noise of its positions. At 10, noise
+makes a path at most 1 % longer. A larger value cuts more corners."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """The stamps of a stream: their count, the first and last (s), the mean rate (Hz) and the longest gap (s)."""
+    """The stamps of a stream: their count, the first and the last stamp (s), the mean rate (Hz) and the longest gap (s)."""
 
     count: int
     start: float
@@ -52,7 +52,7 @@ class Contents:
 
 
 def timing(stamps: Floats) -> Timing:
-    """Compute the timing of stamps (N,), s, N > 0, in any order. The rate is 0 if all stamps are equal."""
+    """Return the timing of stamps (N,), s, in any order. N must be above 0. The rate is 0 if all stamps are equal."""
     times = np.sort(stamps)
     span = float(times[-1] - times[0])
     rate = (len(times) - 1) / span if span > 0 else 0.0
@@ -61,7 +61,7 @@ def timing(stamps: Floats) -> Timing:
 
 
 def contents(log: Log) -> Contents:
-    """Summarise a log."""
+    """Return the summary of a log."""
     streams = [_path("odometry", log.odometry), _path("localization", log.localization)]
     missing = []
     if log.robot_path is None:
@@ -92,7 +92,7 @@ def contents(log: Log) -> Contents:
 
 
 def in_words(found: Contents) -> list[str]:
-    """Describe the streams of a log in sentences: the drive, and what each camera saw."""
+    """Return sentences that describe the robot's path and the data of each camera in a log."""
     by_role = {stream.role: stream for stream in found.streams}
     path = by_role.get("localization") or by_role.get("odometry")
     said = []
@@ -111,9 +111,9 @@ def in_words(found: Contents) -> list[str]:
 
 
 def off_path(where: str, frames: Floats, path: Trajectory | None) -> list[str]:
-    """Return one message if frames have stamps (N,), s, but none of them is within the time of the path.
+    """Return a list of one message if no frame is within the time of the path. Return an empty list in all other cases.
 
-    The list is empty in all other cases. where: the name of the camera in the message.
+    where: the name of the camera in the message. frames: (N,) stamps, s.
     """
     if path is None or len(frames) == 0 or ((frames >= path.stamps[0]) & (frames <= path.stamps[-1])).any():
         return []
@@ -130,18 +130,18 @@ def _path(role: str, path: Trajectory | None) -> Stream | None:
 
 
 def path_length(positions: Floats) -> float:
-    """Return the length of a path, m, without the steps of its noise.
+    """Return the length of a path, m, without the length that noise adds. positions: (N, 3), m.
 
-    A chord goes from a position to the next one that is `_STEP` sigmas of the noise away. The noise along a path cancels
-    from chord to chord. The noise across the path makes a chord longer by (sigma / length)^2, which is at most 1 %.
-    The noise is measured from the second differences of the positions: white noise is large there, and motion is small.
-    positions: (N, 3), m.
+    The length is a sum of chords. A chord goes from a position to the next one that is at least `_STEP` sigma away, where
+    sigma is the standard deviation of the noise. The noise along a path cancels from chord to chord. The noise across the
+    path makes a chord longer by the share (sigma / length)^2, which is at most 1 %. The noise is measured from the second
+    differences of the positions, in which white noise is large and motion is small.
     """
     bends = np.linalg.norm(np.diff(positions, n=2, axis=0), axis=1)
     sigma = float(np.median(bends)) / (RAYLEIGH_MEDIAN * np.sqrt(6.0)) if len(bends) else 0.0
     length, points = 0.0, positions.tolist()
     last = points[0]
-    for point in points[1:]:  # Plain floats: a day of poses at 20 Hz takes a second.
+    for point in points[1:]:  # The loop uses plain floats. It takes 1 s for a day of poses at 20 Hz.
         step = math.dist(last, point)
         if step >= _STEP * sigma:
             length, last = length + step, point

@@ -13,16 +13,16 @@ from objslam.sources.log_folder import CAMERA, CAMERAS, LOCALIZATION, ODOMETRY, 
 _VIDEOS = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"}
 _ARCHIVES = {".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".7z", ".rar"}
 _IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".webp"}
-_LOOKED_AT = 20  # The most subfolders that are searched for recordings and images. A larger number takes longer.
-_SHOWN = 3  # The most names in a message.
+_LOOKED_AT = 20  # The largest number of subfolders that are searched for recordings and images. More subfolders take longer.
+_SHOWN = 3  # The largest number of names in a message.
 _NEEDED = f"a log folder has {CAMERA}, {ODOMETRY} or {LOCALIZATION}, and detections.jsonl or {RGB}.txt"
 
 
 def unknown_recording(path: Path, is_recording: Callable[[Path], bool], looked_for: str) -> LogError:
     """Return the error for a path that is no recording.
 
-    is_recording: the function that returns whether some source reads a path. looked_for: what identifies each source, as
-    text. Raises LogError if the path cannot be read.
+    is_recording: the function that returns whether a source can read a path. looked_for: a text that names the files of each
+    source. Raises LogError if the path cannot be read.
     """
     with reading(path):
         what, hint = _folder(path, is_recording, looked_for) if path.is_dir() else _file(path)
@@ -30,7 +30,7 @@ def unknown_recording(path: Path, is_recording: Callable[[Path], bool], looked_f
 
 
 def _file(path: Path) -> tuple[str, str]:
-    """Return what a file is, and what the user can do with it."""
+    """Return a description of a file, and a hint for the user."""
     ending = path.suffix.lower()
     if not path.is_file():
         return "this is neither a file nor a folder", _NEEDED
@@ -46,7 +46,7 @@ def _file(path: Path) -> tuple[str, str]:
 
 
 def _folder(path: Path, is_recording: Callable[[Path], bool], looked_for: str) -> tuple[str, str]:
-    """Return what a folder holds, and what the user can do with it."""
+    """Return a description of the content of a folder, and a hint for the user."""
     inside = sorted(item for item in path.iterdir() if not item.name.startswith("."))
     if not inside:
         return "the folder is empty", _NEEDED

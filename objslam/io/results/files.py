@@ -16,9 +16,9 @@ PATH = "path.txt"  # The pose map_T_base at each pose of the recorded path.
 RAYS = "rays.parquet"  # Each ray with its object.
 FEATURES = "features.parquet"  # The appearance vectors of the rays that have one.
 MOTIONS = "motions.parquet"  # The odometry between the poses of a joint run.
-VIEWS = "views.parquet"  # The pose of each camera frame. It shows which objects the camera could have seen.
+VIEWS = "views.parquet"  # The pose of each camera frame. These poses show which objects the camera could have seen.
 CONFIG = "config.yaml"  # All settings of the run.
-DOUBTS = "doubts.json"  # Objects that may be one or two, and boxes that became no object.
+DOUBTS = "doubts.json"  # The doubts: objects that may be one object or two, and boxes that became no object.
 SUMMARY = "summary.json"  # Counts, times and warnings. It is written last, so it marks a complete result.
 DETECTIONS = "detections.jsonl"  # The boxes from the detector of the run.
 SURFACE = "reconstruction.ply"  # The mesh of the room.
@@ -30,18 +30,18 @@ EVALUATION = "evaluation.json"  # The evaluation that `objslam eval` writes.
 REPORT = "report.html"  # The page that `objslam report` writes.
 TRUTH_OBJECTS = "groundtruth_objects.json"  # The true objects of the log.
 TRUTH_TRAJECTORY = "groundtruth_trajectory.txt"  # The true path of the log.
-SITE_FRAME = "site"  # The entry `map_frame` in the summary of the map of a site.
-GROUNDTRUTH = "groundtruth"  # The folder in a log that has the ground truth, in the files OBJECTS and TRAJECTORY.
+SITE_FRAME = "site"  # The value of the key `map_frame` in the summary of the map of a site.
+GROUNDTRUTH = "groundtruth"  # The folder of the ground truth in a log. Its files have the names OBJECTS and TRAJECTORY.
 
 PARTS = (
     *(OBJECTS, TRAJECTORY, PATH, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, DETECTIONS, PICTURE, RECORDING),
     *(SURFACE, SURFACE_BEFORE, CLOUD, FEATURES, MOTIONS, VIEWS, DOUBTS, EVALUATION, REPORT),
 )
-"""The files of a result, including the files of later commands. SUMMARY and exported files are not included."""
+"""The names of the files of a result and of later commands on it, without SUMMARY and without exported files."""
 
 
 def hint_below(folder: Path) -> str | None:
-    """Return a hint that lists up to 5 results in the subfolders of a folder, or None if there are no results."""
+    """Return a hint that lists up to 5 subfolders with results, or None if no subfolder has a result."""
     below = sorted(str(file.parent) for file in folder.glob(f"*/{SUMMARY}"))
     if not below:
         return None
@@ -50,7 +50,7 @@ def hint_below(folder: Path) -> str | None:
 
 
 def dump_doubts(doubts: Sequence[Doubt]) -> str:
-    """Return the content of doubts.json, with one doubt a line."""
+    """Return the content of doubts.json. Each doubt is one line."""
     lines = (json.dumps(one.to_dict(), ensure_ascii=False, allow_nan=False) for one in doubts)
     return '{"format": "objslam.doubts/1", "doubts": [' + ",".join(f"\n  {line}" for line in lines) + "\n]}\n"
 

@@ -21,18 +21,21 @@ class ObjectMap(object_map.ObjectMap):
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
-        """Load the map of a result folder, or from a file that `save` wrote. OutputError names the place of an error."""
+        """Load the map from a result folder, or from a file that `save` wrote.
+
+        Raises OutputError, which names the missing file or the malformed object.
+        """
         from objslam.io.results.read import load_map  # deferred, because it imports scipy
 
         found = read_objects(Path(path)) if Path(path).is_file() else load_map(Path(path))
         return cls.of(found)
 
     def save(self, file: str | PathLike[str]) -> None:
-        """Write the map as JSON. `load` returns the same map, bit by bit. OutputError if the file cannot be written."""
+        """Write the map as JSON. `load` restores each finite number exactly. Raises OutputError for a disk error."""
         write_file(Path(file), dump_objects(self).encode())
 
     def to_arrow(self) -> pa.Table:
-        """Return a pyarrow table with one row for each object. `core.object_map.COLUMNS` names the columns."""
+        """Return a pyarrow table with one row for each object. `core.object_map.COLUMNS` has the names of the columns."""
         import pyarrow as pa
 
         rows = [o.row() for o in self.objects]
@@ -41,5 +44,5 @@ class ObjectMap(object_map.ObjectMap):
         )
 
     def to_pandas(self) -> pd.DataFrame:
-        """Return the objects as a pandas data frame. ObjslamError if pandas is not installed."""
+        """Return the objects as a pandas data frame. Raises ObjslamError if pandas is not installed."""
         return to_pandas(self.to_arrow())

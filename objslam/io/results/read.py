@@ -23,18 +23,20 @@ from objslam.io.views_parquet import Views, read_views
 
 
 def load_map(out: Path) -> ObjectMap:
-    """Read the object map of the result folder `out`. OutputError names what is missing or malformed."""
+    """Return the object map of the result folder `out`. Raises OutputError, which names the missing or malformed part."""
     return read_objects(_existing(out, files.OBJECTS))
 
 
 def load_summary(out: Path) -> dict[str, Any]:
-    """Read summary.json of the result folder `out`. OutputError if it is missing or not what a run writes."""
+    """Return the content of summary.json in the result folder `out`. Raises OutputError if it is missing or invalid."""
     return _load_json(_existing(out, files.SUMMARY), Summary)
 
 
 def load_up(path: Path) -> Up:
-    """Read which axis points up in the map of a result folder, or of the objects.json in it. It is z for a map without a
-    summary."""
+    """Return the axis that points up in a map. It is "z" for a map without a summary.
+
+    path: a result folder or a file of objects. Only a file named objects.json takes the axis from the summary beside it.
+    """
     out = path.parent if path.is_file() else path
     known = (out / files.SUMMARY).is_file() and (not path.is_file() or path.name == files.OBJECTS)
     up: Up = load_summary(out).get("up", "z") if known else "z"
@@ -42,14 +44,19 @@ def load_up(path: Path) -> Up:
 
 
 def load_evaluation(out: Path) -> dict[str, Any] | None:
-    """Read evaluation.json of the result folder `out`, None if there is none. OutputError if its content is invalid."""
+    """Return the content of evaluation.json in the result folder `out`, or None if this file is missing.
+
+    Raises OutputError if the content is invalid.
+    """
     file = out / files.EVALUATION
     return _load_json(file, EvaluationFile) if file.is_file() else None
 
 
 def load_doubts(out: Path) -> tuple[Doubt, ...] | None:
-    """Read the doubts of the result folder `out`. None if it has no such file, as from an older
-    version. OutputError if the file is invalid or there is no result."""
+    """Return the doubts of the result folder `out`, or None if doubts.json is missing, as in results of older versions.
+
+    Raises OutputError if doubts.json is invalid or the folder has no result.
+    """
     _existing(out, files.OBJECTS)
     file = out / files.DOUBTS
     return tuple(Doubt.from_dict(entry) for entry in _load_json(file, DoubtsFile)["doubts"]) if file.is_file() else None
@@ -74,12 +81,15 @@ def _refuse_constant(name: str) -> None:
 
 
 def load_trajectory(out: Path) -> Trajectory:
-    """Read map_T_base at each keyframe of the result folder `out`. OutputError names a missing file or malformed line."""
+    """Return map_T_base at each keyframe of the result folder `out`.
+
+    Raises OutputError, which names the missing file or the malformed line.
+    """
     return _load_poses(_existing(out, files.TRAJECTORY))
 
 
 def load_path(out: Path) -> Trajectory:
-    """Read map_T_base at each pose of the recorded path. Raises the same errors as `load_trajectory`."""
+    """Return map_T_base at each pose of the recorded path. Raises the same errors as `load_trajectory`."""
     return _load_poses(_existing(out, files.PATH))
 
 
@@ -95,33 +105,37 @@ def _load_poses(file: Path) -> Trajectory:
 
 
 def load_motions(out: Path) -> Motions | None:
-    """Read the odometry between the poses of the result folder `out`. None if its run used none. OutputError if the file is
-    invalid or there is no result."""
+    """Return the odometry between the poses of the result folder `out`, or None if its run used no odometry.
+
+    Raises OutputError if motions.parquet is invalid or the folder has no result.
+    """
     _existing(out, files.OBJECTS)
     file = out / files.MOTIONS
     return read_motions(file) if file.is_file() else None
 
 
 def load_rays(out: Path) -> RaysTable:
-    """Read the rays of the result folder `out`. OutputError if the file is missing, damaged or of an older version."""
+    """Return the rays of the result folder `out`. Raises OutputError if rays.parquet is missing or invalid."""
     return read_rays(_existing(out, files.RAYS))
 
 
 def load_views(out: Path) -> Views | None:
-    """Read the camera frames of the result folder `out`. None if it has none, as from an older version. OutputError if the
-    file is damaged or there is no result."""
+    """Return the camera frames of the result folder `out`, or None if views.parquet is missing, as from older versions.
+
+    Raises OutputError if views.parquet is damaged or the folder has no result.
+    """
     _existing(out, files.OBJECTS)
     file = out / files.VIEWS
     return read_views(file) if file.is_file() else None
 
 
 def load_truth(path: Path) -> Truth | None:
-    """Read the ground truth at a path, or return None if a folder has no ground truth.
+    """Return the ground truth at a path, or None if a folder has no ground truth.
 
     Args:
         path: an objects file, a folder named groundtruth, a log folder with such a folder, or a result folder with the truth
-            of its log. The objects.json of a result folder is not taken for the truth. To compare a result with another
-            one, give the path of the other's objects.json itself.
+            of its log. The objects.json in a result folder is not read as the truth. To compare two results, give the path
+            of the objects.json of one result as the truth.
     Raises:
         LogError: the path does not exist, or the truth is malformed.
     """
@@ -143,12 +157,12 @@ def load_truth(path: Path) -> Truth | None:
 
 
 def is_site(out: Path) -> bool:
-    """Return whether the folder `out` is the map of a site, which has no path. OutputError as `load_summary`."""
+    """Return whether the folder `out` is the map of a site, which has no path. Raises the same errors as `load_summary`."""
     return (out / files.SUMMARY).is_file() and load_summary(out).get("map_frame") == files.SITE_FRAME
 
 
 def refuse_site(out: Path, name: str) -> None:
-    """Raise OutputError if the folder `out` is the map of a site, which never has the file `name` of a run."""
+    """Raise OutputError if the folder `out` is the map of a site. name: the file of a run that a site does not have."""
     if is_site(out):
         hint = f"look at {files.PICTURE}, or give the result of one of its sessions"
         raise OutputError(f"this is the map of a site, which has no {name}", where=str(out), hint=hint)

@@ -1,6 +1,6 @@
-"""The shapes of summary.json, evaluation.json and doubts.json: which keys a command reads, and what type each has.
+"""The types of the values in summary.json, evaluation.json and doubts.json, for each key that a command reads.
 
-A folder may come from somebody else, so a value of a wrong type must give an error of one clear line. A key that no command
+A folder may come from another person, so a value of a wrong type must give a clear error of one line. A key that no command
 reads may have any value.
 """
 
@@ -150,7 +150,7 @@ class DoubtsFile(_Shape):
 
 
 def fault_of(data: dict[str, Any], shape: type[BaseModel]) -> str | None:
-    """Return the first fault of data that do not fit a shape, as "key: what is wrong"; None if they fit."""
+    """Return the first fault of data that do not fit a shape, as "key: what is wrong". Return None if the data fit."""
     try:
         shape.model_validate(data)
     except ValidationError as error:

@@ -1,6 +1,6 @@
-"""Export of a result to the file formats of other tools, with one module for each format in `formats`.
+"""Export a result to the file formats of other tools. `formats` has one module for each format.
 
-Pictures, recordings and reports are made in `plot`, `viewer` and `report`.
+The packages `plot`, `viewer` and `report` make pictures, recordings and reports.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ def write_export(out: Path, to: str, file: Path | None = None, datum: Datum | No
 
     Args:
         to: the name of a format in `FORMATS`.
-        file: the file to write, by default the format's usual file in `out`.
-        datum: the position of the map on the earth.
+        file: the file to write. The default is the format's usual file in `out`.
+        datum: the position of the map on the earth, None if it is unknown.
     Raises:
         ConfigError: the format does not exist, or it cannot use the given datum.
         OutputError: the result cannot be read or lacks data that the format needs, or the file cannot be written.
@@ -37,7 +37,7 @@ def write_export(out: Path, to: str, file: Path | None = None, datum: Datum | No
 
 
 def dump_export(out: Path, to: str, datum: Datum | None = None) -> bytes:
-    """Return the content of the file that `write_export` writes. Raise its errors."""
+    """Return the content of the file that `write_export` writes. Raises the same errors as `write_export`."""
     from objslam.output.export.content import load_content
 
     return _chosen(to, datum).dump(load_content(out, datum))

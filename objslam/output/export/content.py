@@ -16,7 +16,7 @@ from objslam.io.results.read import is_site, load_map, load_motions, load_trajec
 _SEMI_MAJOR = 6_378_137.0  # The semi-major axis of the WGS 84 ellipsoid, m.
 _FLATTENING = 1 / 298.257223563  # The flattening of the WGS 84 ellipsoid.
 _E2 = _FLATTENING * (2 - _FLATTENING)  # The squared eccentricity of the WGS 84 ellipsoid.
-_ROUNDS = 6  # The iterations for a latitude. Each divides the error by 150. Near the ground 2 are enough, 6 at any height.
+_ROUNDS = 6  # The number of iterations for a latitude. Each divides the error by 150. 2 are enough near the ground.
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,10 @@ class Datum:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Parse the text "latitude,longitude,heading". ConfigError if the text is malformed or out of range."""
+        """Return the datum in the text "latitude,longitude,heading", degrees.
+
+        Raises ConfigError if the text is malformed or a number is out of range.
+        """
         try:
             latitude, longitude, heading = (float(part) for part in text.split(","))
         except ValueError as error:
@@ -42,7 +45,7 @@ class Datum:
     def geodetic(self, points: Floats) -> Floats:
         """Return longitude and latitude (N, 2), degrees, of points (N, 3) in map, m. The error is well below 1 mm.
 
-        Points become east, north and up at the datum, then earth-centred coordinates, then geodetic ones.
+        Points are converted to east, north and up at the datum, then to earth-centred and then to geodetic coordinates.
         """
         latitude, longitude, heading = np.radians([self.latitude, self.longitude, self.heading])
         sine, cosine = np.sin(latitude), np.cos(latitude)
@@ -72,7 +75,10 @@ class Content:
 
 
 def load_content(out: Path, datum: Datum | None = None) -> Content:
-    """Read a result folder or the map of a site. OutputError names a missing or malformed file."""
+    """Return the content of a result folder or of the map of a site, and `datum`.
+
+    Raises OutputError, which names a missing or malformed file.
+    """
     objects = load_map(out)
     path = Trajectory(np.zeros(0), np.zeros((0, 4, 4))) if is_site(out) else load_trajectory(out)
     return Content(out, objects, path, load_motions(out), datum)

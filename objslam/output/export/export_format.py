@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """One format of `objslam export`. Each module in `formats` declares one."""
+    """A format of `objslam export`. Each module in `formats` declares one format."""
 
     name: str  # The value of `--to`.
     file: str  # The usual name of the file in a result folder. A new run deletes the file with this name.
     help: str  # A short description for `--help`, without a full stop.
-    dump: Callable[[Content], bytes]  # Makes the content of the file. OutputError if the result lacks data.
+    dump: Callable[[Content], bytes]  # Returns the content of the file. Raises OutputError if the result lacks data.
     takes_datum: bool = False  # Whether the format uses `Content.datum`.

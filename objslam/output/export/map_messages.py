@@ -22,25 +22,25 @@ if TYPE_CHECKING:
 
 _TEXT, _ADD, _DELETE_ALL = 9, 0, 3  # A type and actions of visualization_msgs/Marker.
 _TYPES: dict[DrawnShape, int] = {"cuboid": 1, "ellipsoid": 2, "cylinder": 3}
-"""The type of marker of each shape: CUBE, SPHERE and CYLINDER. Their three sizes may differ."""
+"""The marker type of each shape: CUBE, SPHERE or CYLINDER. The three sizes of a marker may differ."""
 LAST_STAMP = 2.0**31  # builtin_interfaces/Time overflows at this stamp, s.
-_MIN_SIZE = 0.05  # The least diameter, m, of an object without a body. A smaller one would be invisible in a room.
+_MIN_SIZE = 0.05  # The least diameter, m, of the marker of an object without a body. A smaller marker would be invisible.
 _TEXT_SIZE = 0.15  # The height of a label's text, m.
 
 
 class MapMessages:
-    """Makes messages in the coordinate frame `frame`, of types that ROS 2 Humble and later know. store: serialises them."""
+    """A maker of messages in the frame `frame`, of types in ROS 2 Humble and later. store: serialises the messages."""
 
     def __init__(self, frame: str) -> None:
         self.frame, self.store = frame, typestore()
 
     def make(self, name: str, *values: Any) -> Any:
-        """Make a message of the type `name`, written as package/Name, from the values of its fields in order."""
+        """Return a message of the type `name`, written as package/Name. values: the values of its fields, in order."""
         package, _, plain = name.partition("/")
         return self.store.types[f"{package}/msg/{plain}"](*values)
 
     def header(self, stamp: float) -> Any:
-        """Make a std_msgs/Header from a stamp, s. A stamp that ROS cannot express becomes 0, which is unset in ROS."""
+        """Return a std_msgs/Header with a stamp, s. A stamp out of the range of ROS becomes 0, which means unset in ROS."""
         stamp = stamp if abs(stamp) < LAST_STAMP else 0.0
         time = self.make("builtin_interfaces/Time", *divmod(round(stamp * 1e9), 10**9))
         return self.make("std_msgs/Header", time, self.frame)
@@ -58,14 +58,14 @@ class MapMessages:
         return self.make("geometry_msgs/PoseStamped", self.header(stamp), self.pose(pose))
 
     def transform(self, stamp: float, child: str, pose: Floats) -> Any:
-        """Make a tf2_msgs/TFMessage with the pose (4, 4) of the frame `child` in the maker's frame, at a stamp, s."""
+        """Return a tf2_msgs/TFMessage with the pose (4, 4) of the frame `child` in the frame `self.frame`, at a stamp, s."""
         turn = self._vector("Quaternion", quaternion(pose[None])[0])
         transform = self.make("geometry_msgs/Transform", self._vector("Vector3", pose[:3, 3]), turn)
         stamped = self.make("geometry_msgs/TransformStamped", self.header(stamp), child, transform)
         return self.make("tf2_msgs/TFMessage", [stamped])
 
     def path(self, stamp: float, stamps: Floats, poses: Floats) -> Any:
-        """Make a nav_msgs/Path from poses (N, 4, 4) at stamps (N,), s. stamp: s, of the message itself."""
+        """Return a nav_msgs/Path of poses (N, 4, 4) at stamps (N,), s. stamp: the stamp of the whole message, s."""
         stamped = [self.stamped(t, pose) for t, pose in zip(stamps.tolist(), poses, strict=True)]
         return self.make("nav_msgs/Path", self.header(stamp), stamped)
 
@@ -92,10 +92,10 @@ class MapMessages:
         return self.make("vision_msgs/Detection3D", self.header(stamp), results, box, str(o.id))
 
     def markers(self, stamp: float, objects: ObjectMap, clear_first: bool = False) -> Any:
-        """Make a visualization_msgs/MarkerArray: a shape, a 2-sigma ellipsoid and a caption for each resolved object.
+        """Return a visualization_msgs/MarkerArray: a shape, a 2-sigma ellipsoid and a caption for each resolved object.
 
-        The shape is that in which pictures show the body (`drawn_shape`), with its size and yaw. An object without a body is
-        an ellipsoid of the size of its boxes, at least `_MIN_SIZE`. In the map of a site, the caption also says the state of
+        The shape is the `drawn_shape` of the body, with the size and yaw of the body. An object without a body is an
+        ellipsoid with the size of its boxes, at least `_MIN_SIZE`. In the map of a site, the caption also has the state of
         the object.
 
         Args:

@@ -1,5 +1,5 @@
-"""The pictures: map.png, the changes between maps, and the boxes on a photo. Also the colours, captions and label positions
-that all outputs share.
+"""Draw the pictures: map.png, the changes between maps, and the boxes on a photo.
 
-The 3D recording is in `viewer`, and the HTML page is in `report`.
+This package also has the colours, captions and label positions of all outputs. The 3D recording is made in `viewer`, and the
+HTML page in `report`.
 """

@@ -7,8 +7,8 @@ import numpy as np
 from objslam.core.arrays import Array, Floats
 from objslam.output.plot.style import colours_of
 
-_LINE = 300  # The longer side of the image, divided by the width of a line. A larger number draws thinner lines.
-PICTURES = (".png", ".jpg", ".jpeg")  # The endings of the files that may hold the picture.
+_LINE = 300  # The ratio of the longer side of the image to the width of a line. A larger number draws thinner lines.
+PICTURES = (".png", ".jpg", ".jpeg")  # The possible suffixes of the file of the picture.
 
 Plate = tuple[int, int, int, int]
 """The filled rectangle behind a label: x1, y1, x2, y2, px."""
@@ -39,9 +39,9 @@ def draw_boxes(image: Array, boxes: Floats, labels: Sequence[str], scores: Float
 
 
 def free_plate(wanted: Plate, taken: Sequence[Plate], width: int, height: int) -> Plate:
-    """Return the plate of a label: the wanted plate, moved into the image, and down to a free place if there is one.
+    """Return the plate of a label. The plate `wanted` is moved into the image, and then down to a free place, if possible.
 
-    taken: the plates that are drawn already. width, height: the size of the image, px.
+    taken: the plates of earlier labels. width, height: the size of the image, px.
     """
     x1, y1, x2, y2 = wanted
     left, high = max(0, min(x1, width - (x2 - x1))), y2 - y1

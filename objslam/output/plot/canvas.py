@@ -1,4 +1,4 @@
-"""Draw on an image with smooth edges: OpenCV's shapes and fonts, and thin lines that get darker where they overlap."""
+"""Draw on an image with smooth edges: shapes, texts, and thin lines that are darker where they overlap."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from objslam.core.arrays import Floats
 from objslam.output.plot.figure import Colour
 
-_SHIFT = 4  # OpenCV takes coordinates as integers, here in 1 / 2^4 of a px. A larger number is finer, and overflows earlier.
+_SHIFT = 4  # The fractional bits of OpenCV's integer coordinates: 1 / 2^4 px. With more, smaller coordinates overflow.
 _FAR = 1e6
-"""The largest coordinate, px, of a drawn point. Points beyond are moved to it. OpenCV's coordinates overflow at 1e8 px."""
-_NEAR = 3.0  # The least distance, px, between two drawn points of a line. A larger one cuts off the corners of curves.
-_BATCH = 4_000_000  # The approximate number of steps along segments drawn at once. A larger number takes more memory.
+"""The largest coordinate of a drawn point, px. Larger coordinates are set to this value. OpenCV's overflow at 1e8 px."""
+_NEAR = 3.0  # The least distance between two drawn points of a line, px. A larger distance cuts the corners of curves.
+_BATCH = 4_000_000  # The approximate number of pixels of segments that are drawn at once. A larger number takes more memory.
 _HALO = 0.85  # The opacity of the white around a text, in [0, 1].
 _HALO_WIDTH = 5  # The width, px, of the brush that widens a text to its halo.
 _ROOM = 8  # The room, px, around a text for its halo and for letters that reach out of its box.
@@ -32,10 +32,11 @@ def blank(width: int, height: int) -> Image:
 
 
 def draw_segments(image: Image, ends: Floats, colour: Colour, opacity: float) -> None:
-    """Draw segments (n, 2, 2), px, 1 px wide (Wu 1991). Where k overlap, (1 - opacity)^k of the image shows through."""
+    """Draw segments (n, 2, 2), px, with a width of 1 px (Wu 1991). Under k segments, the image keeps the share
+    (1 - opacity)^k."""
     height, width = image.shape[:2]
     ends = ends[np.isfinite(ends).all(axis=(1, 2))]
-    # The canvas has a rim that takes what lies beside the image: one pixel before it, two behind it.
+    # The canvas has a rim for pixels outside the image: one pixel at the left and top, two at the right and bottom.
     cover = np.zeros((height + 3) * (width + 3))
     for pixel, weight in _pixels_of(ends, width, height):
         cover += np.bincount(pixel, weight, minlength=len(cover))
@@ -47,8 +48,11 @@ def draw_segments(image: Image, ends: Floats, colour: Colour, opacity: float) ->
 
 
 def _pixels_of(ends: Floats, width: int, height: int) -> Iterator[tuple[NDArray[np.int64], Floats]]:
-    """Yield, in batches, the pixels that segments (n, 2, 2), px, touch, and the covered share of each pixel. These are two
-    neighbouring pixels for each px along a segment. A pixel is its number in the canvas of `draw_segments`."""
+    """Yield the pixels that segments (n, 2, 2), px, touch, and the covered share of each pixel, in batches.
+
+    A segment touches two neighbouring pixels for each px of its length. A pixel is given by its index in the flat canvas of
+    `draw_segments`.
+    """
     along = ends[:, 1] - ends[:, 0]
     steep = np.abs(along[:, 1]) > np.abs(along[:, 0])
     ends = np.where(steep[:, None, None], ends[..., ::-1], ends)  # The longer coordinate comes first.
@@ -73,7 +77,7 @@ def _pixels_of(ends: Floats, width: int, height: int) -> Iterator[tuple[NDArray[
 
 
 def draw_line(image: Image, points: Floats, colour: Colour, width: float, dash: tuple[float, float] | None = None) -> None:
-    """Draw a line through points (n, 2), px. dash: the lengths, px, of a dash and of the gap behind it."""
+    """Draw a line through points (n, 2), px. dash: the lengths of a dash and of the gap after it, px, None for no dashes."""
     points = _apart(np.clip(points[np.isfinite(points).all(axis=1)], -_FAR, _FAR))
     if len(points) < 2:
         return
@@ -83,7 +87,8 @@ def draw_line(image: Image, points: Floats, colour: Colour, width: float, dash: 
 
 
 def _apart(points: Floats) -> Floats:
-    """Return the points (n, 2), px, of a line without points too near to the one before. Short pieces would look thick."""
+    """Return the points (n, 2), px, of a line without those nearer than `_NEAR` to the previous point, as short pieces look
+    thick."""
     if len(points) < 3:
         return points
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
@@ -125,7 +130,7 @@ def draw_dot(image: Image, centre: Floats, size: float, colour: Colour, rim: Col
 
 
 def draw_area(image: Image, rim: Floats, colour: Colour, opacity: float) -> None:
-    """Draw a polygon (n, 2), px, filled with a colour, with a rim of 1 px. opacity: of the colour, in [0, 1]."""
+    """Draw a filled polygon (n, 2), px, with a rim of 1 px. opacity: the opacity of the filling, in [0, 1]."""
     if not np.isfinite(rim).all():
         return
     size = np.array(image.shape[1::-1])
@@ -146,8 +151,8 @@ def text_width(text: str, size: float) -> int:
 def draw_text(
     image: Image, text: str, corner: tuple[float, float], size: float, colour: Colour, *, halo: bool = False
 ) -> None:
-    """Draw a text in a box with its upper left corner at x, y, px. size: of the font, px. halo: whether white is around
-    it."""
+    """Draw a text. corner: the upper left corner x, y of its box, px. size: the font size, px. halo: whether the text has a
+    white halo."""
     x, y = round(corner[0]), round(corner[1])
     wide, high = text_width(text, size), round(1.25 * size)
     mask = np.zeros((high + 2 * _ROOM, wide + 2 * _ROOM, 3), dtype=np.uint8)
@@ -169,7 +174,7 @@ def draw_text(
 
 
 def encode_png(image: Image) -> bytes:
-    """Return an image as the content of a PNG file with 256 colours. It looks the same, and has a fifth of the size."""
+    """Return an image as the content of a PNG file with 256 colours. The file looks the same with a fifth of the bytes."""
     from PIL import Image as Picture
 
     few = Picture.fromarray(np.ascontiguousarray(image[..., ::-1])).quantize(

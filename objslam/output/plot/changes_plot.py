@@ -1,4 +1,4 @@
-"""Pictures of the life of objects, from above: what is still there, what moved, what is gone, and what is new."""
+"""Draw pictures from above of objects that are confirmed, moved, gone or new."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ _WHITE: Colour = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class _Look:
-    """The mark of an outcome. Outcomes differ in colour and in the kind of mark, so that the picture is readable without
-    colours. words: what the legend says after the name."""
+    """The look of the marks of an outcome. Outcomes differ in colour and in the kind of mark, so that a picture without
+    colours can be read. words: the text after the name in the legend."""
 
     colour: Colour
     kind: Literal["dot", "plus", "x", "diamond"]
@@ -47,17 +47,17 @@ _LOOKS: dict[str, _Look] = {
     "moved": _Look((0.043, 0.388, 0.773), "diamond"),
     "gone": _Look((0.761, 0.184, 0.184), "x"),
 }
-"""The mark of each outcome."""
+"""The look of the marks of each outcome."""
 
 
 def draw_site(objects: ObjectMap) -> bytes:
-    """Return a PNG of the map of a site, with what became of each object."""
+    """Return a PNG file of the map of a site, with the outcome of each object."""
     items = [(outcome_of(o), o) for o in (*objects.objects, *objects.gone)]
     return render(changes_figure(items, f"{len(objects)} objects"))
 
 
 def draw_comparison(found: Comparison) -> bytes:
-    """Return a PNG of the comparison of two maps, in the frame of the first."""
+    """Return a PNG file of the comparison of two maps, in the frame of the first map."""
     items = [(one.outcome, one.item) for one in found.changes]
     names = [_named(one) for one in found.changes]
     return render(changes_figure(items, "changes since the first map (A, the later one is B)", names))
@@ -70,7 +70,7 @@ def _named(one: Change) -> str:
 
 
 def changes_figure(items: Sequence[tuple[str, MapObject]], title: str, names: Sequence[str] | None = None) -> Figure:
-    """Return what the picture of objects with their outcomes shows. names: of the objects, else their labels and ids."""
+    """Return the figure of objects with their outcomes. names: the texts of the labels. The default is label and id."""
     if names is None:
         names = [f"{o.label} #{o.id}" for _, o in items]
     everything = np.array([o.position[:2] for _, o in items]).reshape(-1, 2)
@@ -100,7 +100,7 @@ def changes_figure(items: Sequence[tuple[str, MapObject]], title: str, names: Se
 
 
 def outcome_of(o: MapObject) -> Fate:
-    """Return what became of an object of a site."""
+    """Return the outcome of an object of a site, such as "moved" or "gone"."""
     return "confirmed" if o.life is None else o.life.state
 
 
@@ -114,7 +114,8 @@ def _before(o: MapObject) -> Floats:
 
 
 def _outlines(objects: Sequence[MapObject], colour: Colour, least: float) -> list[Shape]:
-    """Return the outlines of the bodies of objects. A body shorter than `least`, m, has none, because its mark covers it."""
+    """Return the outlines of the bodies of objects. The outline of a body shorter than `least`, m, is left out, because the
+    mark of the object covers it."""
     rims = (body_outline(o) for o in objects)
     return [Line(rim, colour, _LINE) for rim in rims if rim is not None and np.ptp(rim, axis=0).max() >= least]
 
@@ -132,7 +133,7 @@ def _arrows(starts: Floats, ends: Floats, colour: Colour) -> list[Shape]:
 def _labels(
     figure: Figure, items: Sequence[tuple[str, MapObject]], points: Floats, names: Sequence[str]
 ) -> tuple[Label, ...]:
-    """Return the label of each object that has room for one. Objects that changed come first."""
+    """Return the labels of the objects. Objects that changed come first. A label without a free place is left out."""
     order = sorted(range(len(items)), key=lambda k: items[k][0] in ("confirmed", "unconfirmed"))
     items, points, names = [items[k] for k in order], points[order], [names[k] for k in order]
     rims = [rim for _, o in items if (rim := body_outline(o)) is not None]

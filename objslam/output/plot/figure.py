@@ -1,4 +1,4 @@
-"""What a picture of a map shows: lines, marks, areas and labels, in metres. `page` draws it."""
+"""The content of a picture of a map: lines, marks, areas and labels, in metres. The module `page` draws a figure."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Segments:
-    """Thin segments (n, 2, 2), m. The more of them overlap, the darker they are. opacity: of one segment, in [0, 1]. name:
-    in the legend, "" for no entry."""
+    """Thin segments with the ends (n, 2, 2), m. Overlapping segments are darker. opacity: the opacity of one segment, in
+    [0, 1]. name: the name in the legend, "" for no entry."""
 
     ends: Floats
     colour: Colour
@@ -26,7 +26,7 @@ class Segments:
 
 @dataclass(frozen=True)
 class Line:
-    """A line through points (n, 2), m. width: px. name: in the legend, "" for no entry."""
+    """A line through points (n, 2), m. width: px. name: the name in the legend, "" for no entry."""
 
     points: Floats
     colour: Colour
@@ -37,9 +37,9 @@ class Line:
 
 @dataclass(frozen=True)
 class Marks:
-    """Marks of one size (px) at points (n, 2), m. A cross is thin, a plus has thick arms, and an x is a plus that is turned.
-    rim: the colour of the rim of a dot. name: in the legend, "" for no entry. turn: of a triangle, rad counterclockwise from
-    the right."""
+    """Marks of one size (px) at points (n, 2), m. A cross has thin arms, a plus has thick arms, and an x is a turned plus.
+    rim: the colour of the rim of a dot. name: the name in the legend, "" for no entry. turn: the direction of a triangle,
+    rad counterclockwise from the right."""
 
     points: Floats
     kind: Literal["dot", "cross", "plus", "x", "diamond", "triangle"]
@@ -52,7 +52,7 @@ class Marks:
 
 @dataclass(frozen=True)
 class Area:
-    """A filled area inside the points (n, 2), m, with a rim. opacity: of the filling, in [0, 1]."""
+    """A filled polygon. rim: its corners (n, 2), m. opacity: the opacity of the filling, in [0, 1]."""
 
     rim: Floats
     colour: Colour
@@ -61,7 +61,8 @@ class Area:
 
 @dataclass(frozen=True)
 class Label:
-    """A text in the box (4,) x1, y1, x2, y2, px of the map's area. leader: (2, 2) px, a line to its dot, or None."""
+    """A text in a box. box: (4,) x1, y1, x2, y2, px of the shown area. leader: (2, 2) ends of a line from the dot to the
+    text, px of the shown area, None for no line."""
 
     text: str
     colour: Colour
@@ -76,9 +77,9 @@ Shape = Segments | Line | Marks | Area
 class Figure:
     """A picture of a map from above.
 
-    axes: the names of the axes to the right and up. low, high: (2,) m, the corners of the shown area. scale: px/m. shapes:
-    what is drawn, the lowest first. legend: more entries. Each shape with a name has one anyway. note: a remark at the upper
-    right. warning: why the map should not be trusted, under the title.
+    axes: the names of the axes to the right and up. low, high: (2,) corners of the shown area, m. scale: px/m. shapes: the
+    drawn shapes, in the order of drawing. legend: entries of the legend for which no shape has a name. note: a remark at the
+    upper right. warning: a text under the title with the reason why the map should not be trusted.
     """
 
     title: str

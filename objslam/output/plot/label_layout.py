@@ -7,17 +7,17 @@ from objslam.core.arrays import Bools, Floats
 
 _ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)  # The directions, rad, of candidate positions from a dot.
 _RADII = np.array([9.0, 15.0, 24.0, 38.0, 56.0, 80.0, 110.0, 145.0, 185.0])
-"""The distances, px, of a label's candidate positions from its dot. A larger distance costs more."""
+"""The distances of a label's candidate positions from its dot, px. A larger distance costs more."""
 _DOT = 6.0  # Half the side, px, of the square around a dot that no label covers.
 _PAD = 2.0  # The least distance, px, between two labels.
-_CROWDED = 60.0  # Dots within this distance, px, crowd a dot. The labels of the most crowded dots are placed first.
-_FAR = 14.0  # The distance, px, from its dot beyond which a label gets a leader line.
-_AMBIGUOUS = 2.0  # A label is ambiguous if another dot is nearer than its own dot, or farther by at most this, px.
+_CROWDED = 60.0  # The distance, px, within which dots count as crowded. Labels of the most crowded dots are placed first.
+_FAR = 14.0  # The largest distance of a label from its dot without a leader line, px.
+_AMBIGUOUS = 2.0  # The least distance, px, by which other dots must be farther than the label's own dot, or it is ambiguous.
 _AMBIGUOUS_COST = 60.0  # The cost, px, of an ambiguous label. With a larger cost, fewer labels are ambiguous.
 _COVER_COST = 1.5  # The cost, px, of each point in `avoid` that a label covers.
-_MOST_COVERED = 20  # At most this many covered points add to the cost.
+_MOST_COVERED = 20  # The largest number of covered points that add to the cost.
 _CROSSING_COST = 60.0  # The cost, px, of each line, label or dot that a leader line crosses.
-_OUTWARD_GAIN = 0.05  # The gain, px, for each px away from the mean of all dots. It keeps the middle free.
+_OUTWARD_GAIN = 0.05  # The cost that is saved, px, for each px away from the mean of all dots. This keeps the middle free.
 
 
 def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -> tuple[Floats, Bools]:
@@ -79,7 +79,7 @@ def _candidates(anchor: Floats, size: Floats) -> tuple[Floats, Floats]:
 
 
 def _counts(points: Floats, frame: Floats) -> Floats:
-    """Return for each pixel corner of an area the number of points (P, 2) below and left of it: a summed-area table.
+    """Return the summed-area table of points (P, 2). It has, for each pixel corner, the number of points below and left.
 
     A test of each of 100,000 points for each candidate would take minutes. With the table, `_covered` is fast.
     """
@@ -93,7 +93,7 @@ def _counts(points: Floats, frame: Floats) -> Floats:
 
 
 def _covered(boxes: Floats, counts: Floats, origin: Floats) -> Floats:
-    """Return how many points (A,) lie in the pixels that each box (A, 4) touches.
+    """Return the number (A,) of points in the pixels that each box (A, 4) touches.
 
     counts: the table of `_counts`. origin: (2,) the lower left corner of the area of the table.
     """
@@ -103,7 +103,7 @@ def _covered(boxes: Floats, counts: Floats, origin: Floats) -> Floats:
 
 
 def needs_leader(anchors: Floats, corners: Floats, sizes: Floats) -> Bools:
-    """Return a mask (N,) of the labels that need a line to their dot: distant labels and ambiguous labels."""
+    """Return a mask (N,) of the labels that need a line to their dot. These are the distant and the ambiguous labels."""
     boxes = np.concatenate([corners, corners + sizes], axis=1)
     own = np.linalg.norm(np.clip(anchors, corners, corners + sizes) - anchors, axis=1)
     others = np.array([_nearest(boxes[j : j + 1], np.delete(anchors, j, axis=0))[0] for j in range(len(anchors))])

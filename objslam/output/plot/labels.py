@@ -15,15 +15,15 @@ from objslam.output.plot.page import FONT, LINE
 _STEP = (
     2.0  # The distance, px, between the points of an outline that labels avoid. A larger one lets labels cover more of it.
 )
-_MAX_LETTERS = 28  # A label has at most this many letters. An ellipsis replaces the rest.
+_MAX_LETTERS = 28  # The largest number of letters of a label. An ellipsis replaces the rest.
 
 
 def make_labels(
     figure: Figure, names: Sequence[str], colours: Sequence[Colour], points: Floats, avoid: Floats
 ) -> tuple[Label, ...]:
-    """Return a label beside each point (N, 2), m. A name that has no room has no label.
+    """Return a label beside each point (N, 2), m. A name without a free place has no label.
 
-    avoid: (P, 2) px of the shown area, points that labels should not cover.
+    names: N texts. avoid: (P, 2) points that labels should not cover, px of the shown area.
     """
     sizes = np.array([(text_width(text, FONT), LINE * FONT) for text in names]).reshape(-1, 2)
     anchors = figure.pixels(points) if len(points) else np.zeros((0, 2))
@@ -38,9 +38,9 @@ def make_labels(
 
 
 def drawn_points(rim: Floats) -> Floats:
-    """Return points (P, 2), px, along a drawn outline (n, 2), px, so dense that no label gets between them.
+    """Return points (P, 2), px, along an outline (n, 2), px, at most about `_STEP` px apart. No label fits between them.
 
-    The outline of a cuboid has its corners alone, between which a label would have room.
+    The outline of a cuboid has only its corners, and a label would fit between two corners.
     """
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(rim, axis=0), axis=1)))
     at = np.linspace(0.0, way[-1], max(int(way[-1] / _STEP), 1) + 1)

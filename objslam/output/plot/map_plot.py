@@ -17,23 +17,23 @@ from objslam.output.plot.labels import make_labels, shortened
 from objslam.output.plot.page import render
 from objslam.output.plot.style import body_outline, captions, frame_objects, label_colours, ray_ends, ray_kinds, sample
 
-_MAX_RAYS = 2000  # The picture shows at most this many used rays. More rays would merge into one blue area.
-_MAX_REJECTED = 400  # The picture shows at most this many rejected rays, because they cross the whole map.
-_MAX_LABELS = 150  # The picture has at most this many labels. The objects with the most rays come first.
-_PATH_POINTS = 1500  # Labels avoid at most this many points of the path.
-_WEIGHT = 5  # A label that covers a point of a cross or of an ellipse is as bad as one that covers this many of the path.
-_CROSS = 17.0  # The cross of a true object has this width and height, px.
-_DOT, _START = 11.0, 15.0  # The dot of an object, and the circle at the start of the path, have these diameters, px.
-_ELLIPSE_POINTS = 96  # An ellipse is drawn with this many points, which labels avoid. With fewer, labels get between them.
+_MAX_RAYS = 2000  # The largest number of used rays in the picture. More rays would merge into one blue area.
+_MAX_REJECTED = 400  # The largest number of rejected rays in the picture. It is small, because they cross the whole map.
+_MAX_LABELS = 150  # The largest number of labels in the picture. The objects with the most rays come first.
+_PATH_POINTS = 1500  # The largest number of points of the path that labels avoid.
+_WEIGHT = 5  # The cost for a label to cover a point of a cross or an ellipse, as a multiple of that for a point of the path.
+_CROSS = 17.0  # The width and height of the cross of a true object, px.
+_DOT, _START = 11.0, 15.0  # The diameters of the dot of an object, and of the circle at the start of the path, px.
+_ELLIPSE_POINTS = 96  # The number of points of a drawn ellipse, which labels avoid. With fewer points, labels fit between.
 _LONG_SIDE, _SHORT_SIDE = 1350.0, 600.0  # The longer side of the map, and its least width, px. Its least height is 300 px.
 _GROWTH = 0.4
-"""Ellipses widen the shown area by at most this share of its longer side, on each side. The edge of the picture cuts off
-larger ellipses. A larger share shows more of them, and shrinks the rest of the map. At 0.4, the ellipse of a cup is shown
-whole after a drive of 1 m past it, and no ellipse shrinks the rest to less than half."""
-_EDGE = 0.985  # The triangle of a far object is at this share of the way from the centre of the picture to the edge.
-_TRIANGLE = 18.0  # The triangle of a far object has this length, px.
+"""The largest widening of the shown area by ellipses on each side, as a share of its longer side. The edge of the picture
+cuts off larger ellipses. A larger share shows more of large ellipses, and shrinks the rest of the map. At 0.4, the ellipse
+of a cup is whole after a drive of 1 m past the cup, and no ellipse shrinks the rest to less than half."""
+_EDGE = 0.985  # The place of a far object's triangle, as a share of the way from the picture's centre to its edge.
+_TRIANGLE = 18.0  # The length of the triangle of a far object, px.
 _PATH, _BAND = 2.0, 1.0  # The widths, px, of a path, and of the outlines of a body that is 2 sigma smaller or larger.
-_LIGHT = 0.45  # How much lighter than the outline of the body these outlines are, from 0 to 1. At 1, they are white.
+_LIGHT = 0.45  # The share of white, from 0 to 1, in the colour of the outlines of a body that is 2 sigma smaller or larger.
 _TAG, _NORMAL = 4.0, 0.3  # The width, px, of the outline of a fiducial, and the length, m, of the line along its normal.
 _USED, _REJECTED = (0.561, 0.749, 0.933), (0.937, 0.561, 0.525)  # Used rays are light blue, and rejected rays are light red.
 _BEFORE, _AFTER = (0.541, 0.541, 0.541), (0.188, 0.204, 0.231)  # The colours of the path before and after the estimation.
@@ -43,13 +43,15 @@ _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
 
 def draw_map(result: RunResult, file: Path, truth: Truth | None = None) -> None:
-    """Draw the paths, rays, objects and ground truth from above as a PNG. truth: in the map's frame. OSError if the file
-    cannot be written."""
+    """Draw the paths, rays, objects and ground truth from above, as a PNG file.
+
+    truth: the ground truth in the map's frame. Raises OSError if the file cannot be written.
+    """
     file.write_bytes(render(map_figure(result, truth)))
 
 
 def map_figure(result: RunResult, truth: Truth | None = None) -> Figure:
-    """Return what the picture of a map shows."""
+    """Return the figure of a map from above. truth: the ground truth in the map's frame."""
     plane = from_above(up_axis(result.keyframes))
     points = result.map.positions[:, plane]
     crosses = np.array([o.position[plane] for o in truth.objects] if truth else []).reshape(-1, 2)
@@ -135,7 +137,7 @@ def _paths(result: RunResult, truth: Truth | None, plane: list[int]) -> list[Sha
 
 
 def _objects(result: RunResult, plane: list[int], points: Floats) -> tuple[list[Shape], list[Shape]]:
-    """Return the ellipses and the dashed rays of the objects, and then the dots. points: (N, 2) m, in the plane."""
+    """Return two lists: the ellipses, outlines and dashed rays of the objects, and their dots. points: (N, 2), m."""
     colours = label_colours(result.map)
     below: list[Shape] = []
     dots: list[Shape] = []
@@ -184,8 +186,8 @@ def _legend(result: RunResult) -> tuple[Line | Marks, ...]:
 
 
 def _ellipse(o: MapObject, plane: list[int]) -> Floats | None:
-    """Return the rim (_ELLIPSE_POINTS, 2), m, of an object's 2-sigma ellipse in the plane, None without a finite
-    covariance."""
+    """Return the rim (_ELLIPSE_POINTS, 2), m, of an object's 2-sigma ellipse in the plane. Return None for an unresolved
+    object, or without a finite covariance."""
     if o.status != "ok" or o.covariance is None or not np.isfinite(o.covariance).all():
         return None
     turn = np.linspace(0, 2 * np.pi, _ELLIPSE_POINTS, endpoint=False)
@@ -194,16 +196,16 @@ def _ellipse(o: MapObject, plane: list[int]) -> Floats | None:
 
 
 def _at_edge(points: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """For each far point (F, 2), return the point (F, 2) at the picture's edge in the same direction, and the distance (F,)
-    between the two. All are in m."""
+    """Return, for each far point (F, 2), the point (F, 2) at the picture's edge in the same direction, and the distance (F,)
+    between the two points, all in m."""
     centre, half = (low + high) / 2, (high - low) / 2
     at = centre + (points - centre) * (_EDGE / (np.abs(points - centre) / half).max(axis=1, initial=1e-9))[:, None]
     return at, np.linalg.norm(points - at, axis=1)
 
 
 def _far(objects: list[MapObject], result: RunResult, at: Floats, centre: Floats) -> list[Shape]:
-    """Return a triangle for each object that is far outside. It points to the object. at: (F, 2) m, at the picture's edge.
-    centre: (2,) m, of the picture."""
+    """Return, for each object far outside, a triangle that points to the object. at: (F, 2) places at the picture's edge, m.
+    centre: (2,) centre of the picture, m."""
     colours = label_colours(result.map)
     return [
         Marks(place[None], "triangle", colours[o.label], _WHITE, _TRIANGLE, "", float(np.arctan2(*(place - centre)[::-1])))
@@ -222,7 +224,7 @@ def _title(result: RunResult) -> str:
 
 
 def _warning(result: RunResult) -> str:
-    """Return why the map should not be trusted, "" for a good map or one without an assessment."""
+    """Return the reason why the map should not be trusted. Return "" for a good map, or without an assessment."""
     judged = result.summary.get("assessment", {"level": "good"})
     said = HEADLINES[judged["level"]]
     return "" if judged["level"] == "good" else " ".join([said, *judged["reasons"]])
@@ -231,10 +233,10 @@ def _warning(result: RunResult) -> str:
 def _labels(
     figure: Figure, result: RunResult, points: Floats, shown: Bools, names: Any, avoid: tuple[Floats, Floats, Floats]
 ) -> tuple[Label, ...]:
-    """Place at most `_MAX_LABELS` labels. An object whose label has no room has none.
+    """Return at most `_MAX_LABELS` placed labels. A label without a free place is left out.
 
-    points: (N, 2) m. shown: (N,) which objects may have a label. names: (N,) the texts. avoid: points (P, 2), m, of the
-    path, of the crosses, and of the ellipses and the outlines of bodies.
+    points: (N, 2) m. shown: (N,) which objects may have a label. names: (N,) the texts. avoid: three arrays of points
+    (P, 2), m, that labels should not cover: of the path, of the crosses, and of the ellipses and outlines of bodies.
     """
     path, crosses, outlines = (figure.pixels(part) for part in avoid)
     colours = label_colours(result.map)

@@ -18,17 +18,17 @@ from objslam.output.plot.canvas import (
 )
 from objslam.output.plot.figure import Area, Figure, Line, Marks, Segments, Shape
 
-FONT = 17.0  # Labels and the legend have this font size, px.
-LINE = 1.25  # The height of a line of text, divided by its font size. A larger number has more room between lines.
-_TITLE = 21.0  # The title has this font size, px.
-_NOTE = 15.0  # The remark has this font size, px.
-_MARGIN = 16  # The white, px, around the picture and between its parts.
-_MOST_TICKS = 8  # At most this many steps of the grid fit the longer side of the map.
-_WARNING_LINES = 3  # The warning has at most this many lines. An ellipsis replaces the rest, which the terminal shows.
-_COLUMNS = 4  # The legend has at most this many columns.
-_HANDLE = 34  # The width, px, of an entry's sample in the legend.
-_DASH, _GAP = 8.0, 4.0  # The lengths, px, of a dash and of the gap behind it.
-_TICK = 6  # The length, px, of a tick.
+FONT = 17.0  # The font size of labels and of the legend, px.
+LINE = 1.25  # The height of a line of text, as a multiple of its font size. A larger number gives more room between lines.
+_TITLE = 21.0  # The font size of the title, px.
+_NOTE = 15.0  # The font size of the remark, px.
+_MARGIN = 16  # The width of the white margin around the picture and between its parts, px.
+_MOST_TICKS = 8  # The largest number of grid steps along the longer side of the map.
+_WARNING_LINES = 3  # The largest number of lines of the warning. An ellipsis replaces the rest, which the terminal shows.
+_COLUMNS = 4  # The largest number of columns of the legend.
+_HANDLE = 34  # The width of the sample of an entry in the legend, px.
+_DASH, _GAP = 8.0, 4.0  # The lengths of a dash and of the gap after a dash, px.
+_TICK = 6  # The length of a tick, px.
 _BLACK, _GREY, _RED = (0.0, 0.0, 0.0), (0.47, 0.47, 0.47), (0.65, 0.1, 0.07)
 _GRID, _FRAME = (0.925, 0.925, 0.925), (0.77, 0.77, 0.77)
 
@@ -74,8 +74,8 @@ def render(figure: Figure) -> bytes:
 
 
 def wrapped(text: str, width: float, font: float, most: int) -> list[str]:
-    """Return a text as at most `most` lines that are no wider than `width` px where words allow it. An ellipsis replaces the
-    words that have no room."""
+    """Return a text as at most `most` lines. Only a line of a single long word is wider than `width` px. An ellipsis
+    replaces the words without room. font: the font size, px."""
     lines: list[str] = []
     for word in text.split():
         if lines and text_width(f"{lines[-1]} {word}", font) <= width:
@@ -91,7 +91,7 @@ def wrapped(text: str, width: float, font: float, most: int) -> list[str]:
 
 
 def _area(figure: Figure) -> Image:
-    """Return the picture of the shown area of the map. What reaches beyond its edges is cut off."""
+    """Return the picture of the shown area of the map. The edges of the picture cut off all that is outside."""
     width, height = figure.size
     area = blank(width, height)
     ticks = _ticks(figure)
@@ -121,7 +121,7 @@ def _draw_shape(area: Image, figure: Figure, shape: Shape) -> None:
 
 
 def _turned(angle: float) -> Floats:
-    """Return the matrix (2, 2) by which points, as rows, turn counterclockwise."""
+    """Return the matrix (2, 2) that turns points counterclockwise by an angle, rad. The points are rows: points @ matrix."""
     return np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
 
 
@@ -133,7 +133,7 @@ _RIMS = {
     "diamond": np.array([(1, 0), (0, 1), (-1, 0), (0, -1)]),
     "triangle": np.column_stack([np.cos(np.radians([0, 130, 230])), np.sin(np.radians([0, 130, 230]))]),
 }
-"""The corners of the marks that are areas, x to the right and y up, with half a mark's size as the unit."""
+"""The corners of each filled mark, as multiples of half the size of the mark. x is to the right, and y is up."""
 
 
 def _draw_marks(image: Image, points: Floats, marks: Marks) -> None:
@@ -197,7 +197,7 @@ def _legend(figure: Figure) -> Image:
 
 
 def _draw_sample(image: Image, entry: Segments | Line | Marks, ends: Floats) -> None:
-    """Draw what an entry of the legend stands for, between two points (2, 2), px."""
+    """Draw the sample of an entry of the legend. ends: (2, 2) the left and the right end of its place, px."""
     if isinstance(entry, Marks):
         _draw_marks(image, ends.mean(axis=0, keepdims=True), entry)
     else:

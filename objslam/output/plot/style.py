@@ -1,4 +1,4 @@
-"""Colours, captions, ray lengths and the shown area of the map, for all pictures, recordings and exports."""
+"""Choose colours, captions, ray lengths and the shown area of the map, for all pictures, recordings and exports."""
 
 import colorsys
 import re
@@ -21,42 +21,42 @@ RayKind = Literal["used", "rejected", "unexplained"]
 DrawnShape = Literal["ellipsoid", "cuboid", "cylinder"]
 """The shapes in which pictures show bodies."""
 
-REJECTED_BELOW = 0.5  # A ray is rejected if its robust weight, in [0, 1], is below this value. A larger value rejects more.
-_USUAL_REACH = 2.0  # Rays are drawn with this length, m, if no ray has an object.
+REJECTED_BELOW = 0.5  # The least robust weight, in [0, 1], of a used ray. A larger value rejects more rays.
+_USUAL_REACH = 2.0  # The length of drawn rays, m, if no ray has an object.
 _HUES = 12
-"""The number of hues on the circle. If a map has more labels, the others get hues in between. With a larger number, hues are
-harder to tell apart. With a smaller one, a label more often has another colour in a map with other labels. The number is
-even, so that the luminances alternate."""
-_NEXT = 5  # A label whose hue is taken tries the hue this many further on. It has no divisor in common with `_HUES`.
+"""The number of hues on the colour circle. If a map has more labels, the other labels get hues between two of them. With a
+larger number, hues are harder to distinguish. With a smaller number, the colour of a label changes more often from map to
+map. The number is even, so that the luminances alternate."""
+_NEXT = 5  # The step in hues from a taken hue to the next one that is tried. It has no common divisor with `_HUES`.
 _NAMED_HUES = {
     **{"red": 0, "orange": 1, "yellow": 2, "lime": 3, "green": 4, "turquoise": 5, "cyan": 6},
     **{"blue": 8, "violet": 9, "purple": 9, "magenta": 10, "pink": 11},
 }
-"""The hues, on the circle of `_HUES`, of words in labels: a red buoy that is drawn in blue misleads."""
-_SATURATION = 0.85  # The colours of labels have this saturation, in [0, 1].
+"""The hue, from 0 to `_HUES` - 1, of each colour word in labels. A red buoy in blue would mislead the reader."""
+_SATURATION = 0.85  # The saturation of the colours of labels, in [0, 1].
 _LUMINANCES = (0.09, 0.17)
-"""Neighbouring hues alternate between these relative luminances, in [0, 1], so that many colours stay distinct. Text in
-either luminance has a contrast of at least 4.5 on white (WCAG 2.1)."""
+"""The relative luminances of colours, in [0, 1]. Neighbouring hues have different ones, so that many colours stay distinct.
+Text in either luminance has a contrast of at least 4.5 on white (WCAG 2.1)."""
 _CORE, _AROUND = 0.1, 1.5
 """The limits of the shown area of a map without a path. The box of the objects leaves out the share `_CORE` of the objects
 on each side. A picture shows all objects up to `_AROUND` times the box's diagonal away from the box, or farther if `_FENCE`
-says so. A larger `_CORE` hides more far objects. A larger `_AROUND` hides fewer far objects."""
+gives a larger distance. A larger `_CORE` hides more far objects. A larger `_AROUND` hides fewer far objects."""
 _KNOWN_HEADING, _LONGER = np.radians(15), 2.0
-"""A picture shows the corners of a cuboid under two conditions. The standard deviation of its yaw is below `_KNOWN_HEADING`
-(rad). Its length exceeds its width by more than `_LONGER` standard deviations of their difference. With 15 degrees, an error
-of three sigmas turns a square by 45 degrees, so that its corners are where the middles of its sides were. Without the second
-condition, a bottle of TUM fr3_office was a square. A larger `_KNOWN_HEADING` and a smaller `_LONGER` draw more round things
-as turned squares."""
-_OUTLINE_POINTS = 96  # An ellipse is drawn with this many points, which labels avoid. With fewer, labels get between them.
+"""The limits for a cuboid that is drawn with corners. The standard deviation of its yaw must be below `_KNOWN_HEADING`
+(rad). Its length must exceed its width by more than `_LONGER` standard deviations of the difference. With 15 degrees, an
+error of three sigmas turns a square by 45 degrees, so that its corners are where the middles of its sides were. Without the
+second limit, a bottle of TUM fr3_office was drawn as a square. With a larger `_KNOWN_HEADING` or a smaller `_LONGER`, more
+round things are drawn as turned squares."""
+_OUTLINE_POINTS = 96  # The number of points of a drawn ellipse, which labels avoid. With fewer points, labels fit between.
 _MOST, _FENCE = 0.9, (2.0, 0.15, 1.0)
-"""A picture shows an object if its distance from the path is at most the largest of three distances. The first is
+"""The limits for far objects. A picture shows an object up to the largest of three distances from the path. The first is
 `_FENCE[0]` times the distance within which the share `_MOST` of the objects lies. The second is the share `_FENCE[1]` of the
 diagonal of the path's bounding box. The third is `_FENCE[2]` (m). At 0.15 of the diagonal, a lone object beside a square
 path adds a fifth to the area. Larger values show more far objects and shrink the rest of the map."""
 
 
 def ray_kinds(result: RunResult) -> dict[RayKind, Bools]:
-    """Return, for each kind, a mask (R,) of the rays of this kind."""
+    """Return a mask (R,) of the rays of each kind."""
     explained = result.association.object >= 0
     used = explained & (result.weight >= REJECTED_BELOW)
     return {"used": used, "rejected": explained & ~used, "unexplained": ~explained}
@@ -78,7 +78,7 @@ def ray_ends(result: RunResult) -> Floats:
 
 
 def captions(objects: ObjectMap) -> list[str]:
-    """Return a caption for each object: its label, followed by #id if several objects have the label."""
+    """Return a caption for each object. The caption is the label, followed by #id if several objects have this label."""
     shared = Counter(o.label for o in objects.objects)
     return [printable(o.label if shared[o.label] == 1 else f"{o.label} #{o.id}") for o in objects.objects]
 
@@ -96,8 +96,9 @@ def colours_of(labels: Sequence[str]) -> dict[str, tuple[float, float, float]]:
 def _slots(labels: Sequence[str]) -> dict[str, float]:
     """Return the place of each label on the circle of hues, from 0 to `_HUES`.
 
-    The place depends on the name, so that a label has one colour in all maps. A label that names a colour has it, or the
-    nearest free one. If two other names of a map have the same place, the later one in the alphabet takes another place.
+    The place depends on the name, so that a label has the same colour in all maps. A label with the name of a colour has
+    this colour, or the nearest free hue. If two other labels have the same place, the later one in the alphabet gets another
+    place.
     """
     slots: dict[str, float] = {}
     taken: set[int] = set()
@@ -117,20 +118,21 @@ def _slots(labels: Sequence[str]) -> dict[str, float]:
 
 
 def _named_hue(label: str) -> int | None:
-    """Return the hue of the first word in a label that names a colour, None if none does."""
+    """Return the hue of the first word in a label that names a colour, or None if no word names a colour."""
     words = re.findall("[a-z]+", label.lower())
     return next((_NAMED_HUES[word] for word in words if word in _NAMED_HUES), None)
 
 
 def _between(turn: int) -> float:
-    """Return the numbers 0, 1/2, 1/4, 3/4, 1/8, ... (van der Corput), which fill the space between two hues evenly."""
+    """Return the number at index `turn` of the series 0, 1/2, 1/4, 3/4, 1/8, ... (van der Corput), which fills the space
+    between two hues evenly."""
     return sum((turn >> bit & 1) / 2 ** (bit + 1) for bit in range(turn.bit_length()))
 
 
 def object_colours(objects: ObjectMap) -> list[tuple[float, float, float]]:
     """Return a colour for each object, as red, green and blue in [0, 1].
 
-    The first object of a label has the label's colour. The others have nearby hues.
+    The first object of a label has the label's colour. The other objects of the label have nearby hues.
     """
     slots = _slots([o.label for o in objects.objects])
     shared, earlier = Counter(o.label for o in objects.objects), Counter[str]()
@@ -153,7 +155,7 @@ def _colour(hue: float, number: int) -> tuple[float, float, float]:
 def ellipsoid(o: MapObject) -> tuple[Floats, Floats] | None:
     """Return the lengths (3,), m, of the half axes of an object's 2-sigma ellipsoid, and a rotation matrix (3, 3).
 
-    The columns of the matrix are the directions of the axes. None if the object has no finite covariance.
+    The columns of the matrix are the directions of the axes. Return None if the object has no finite covariance.
     """
     if o.covariance is None or not np.isfinite(o.covariance).all():
         return None
@@ -165,9 +167,9 @@ def ellipsoid(o: MapObject) -> tuple[Floats, Floats] | None:
 def drawn_shape(body: Body) -> DrawnShape:
     """Return the shape in which pictures show a body.
 
-    A sphere is an ellipsoid. A cuboid whose heading is not known is a cylinder of its length, width and height, because its
-    corners may be anywhere around it. The heading is the direction of the length, so it is known only if the length is the
-    longer side for sure.
+    A sphere is an ellipsoid. A cuboid with an unknown heading is a cylinder of its length, width and height, because the
+    directions of its corners are unknown. The heading is the direction of the length. The heading is therefore known only
+    if the length is certainly longer than the width.
     """
     if body.shape != "cuboid":
         return "cylinder" if body.shape == "cylinder" else "ellipsoid"
@@ -179,10 +181,10 @@ def drawn_shape(body: Body) -> DrawnShape:
 def body_outline(o: MapObject, sigmas: float = 0.0) -> Floats | None:
     """Return the closed outline (n, 2), m, of an object's body seen from above, along z.
 
-    It is a rectangle if the body is drawn as a cuboid (`drawn_shape`), and an ellipse otherwise. A point has no outline, and
-    neither has a body without length or width.
+    The outline is a rectangle if the body is drawn as a cuboid (`drawn_shape`), and an ellipse otherwise. Return None for an
+    unresolved object, for an object without a body, and if the length or the width is not above 0.
 
-    sigmas: how many standard deviations are added to the length and the width of the body.
+    sigmas: the number of standard deviations that are added to the length and the width of the body.
     """
     body = o.body
     if body is None or o.status != "ok":
@@ -216,11 +218,11 @@ def evenly(count: int, most: int) -> Ints:
 
 
 def frame_objects(objects: Floats, path: Floats) -> tuple[Bools, Floats, Floats]:
-    """Choose the objects and the area that a picture shows.
+    """Return the objects and the area that a picture shows.
 
     A far object is left out, because it would shrink the rest of the map. `_FENCE` limits the distance of an object from the
-    bounding box of the path. The box leaves out 1 % of the path on each side. Without a path, it is the box of the objects,
-    and leaves out `_CORE` of them on each side.
+    bounding box of the path. This box leaves out 1 % of the path on each side. Without a path, the box is the bounding box
+    of the objects, and leaves out the share `_CORE` of them on each side.
 
     Args:
         objects, path: positions (N, D) and (K, D), m in map.

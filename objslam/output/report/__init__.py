@@ -1,6 +1,6 @@
-"""The report: one HTML page that shows a result folder, and that a reader can open offline, print or send.
+"""Make the report, one HTML page that shows a result folder. A reader can open the page offline, print it or send it.
 
-The errors against the ground truth are computed in `evaluation`, and the picture of the map is drawn in `plot`.
+`evaluation` computes the errors against the ground truth, and `plot` draws the picture of the map.
 """
 
 from objslam.output.report.page import write_report

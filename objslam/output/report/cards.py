@@ -1,4 +1,4 @@
-"""The cards of the page: what the page shows of each object."""
+"""Make the cards of the page. A card has the data of one object."""
 
 import re
 from dataclasses import dataclass
@@ -17,16 +17,16 @@ from objslam.output.report.scene import hexadecimal
 from objslam.output.report.sketch import Sketch, sketch
 from objslam.output.report.timeline import Timeline, timeline
 
-_BINS = 16  # The number of bars in the histogram of an object. More bars show more detail, and each has fewer rays.
-_NEIGHBOURS = 2  # The number of nearest objects of the label on a card. More would say little about duplicates.
+_BINS = 16  # The number of bars in the histogram of an object. More bars show more detail, and each bar has fewer rays.
+_NEIGHBOURS = 2  # The most objects of the same label on a card, the nearest first. Farther objects are rarely duplicates.
 
 
 @dataclass(frozen=True)
 class Neighbour:
     """A resolved object with the same label as the object of a card.
 
-    distance: between the two objects, m. sigmas: their Mahalanobis distance, by the sum of both covariances. None if a
-    covariance is unknown.
+    distance: the distance between the two objects, m. sigmas: their Mahalanobis distance, with the sum of both covariances.
+    It is None if a covariance is unknown.
     """
 
     object: MapObject
@@ -63,11 +63,11 @@ def make_cards(
     path: Floats,
     up: Up,
 ) -> list[Card]:
-    """Return the cards, sorted by label and id. The times on a card count from the first ray of the result, s.
+    """Return the cards, sorted by label and id. Times on a card are in s since the first ray of the result.
 
-    rays: all rays of the result. crops: the pictures by object id. errors: by object id, the distance from the true object,
-    m, and a text that names the true object. path: (K, 3) positions of the robot, m in map. up: the axis of the map that
-    points up.
+    rays: all rays of the result. crops: maps each object id to its pictures. errors: maps each matched object id to the
+    distance from the true object, m, and a text that names the true object. path: (K, 3) positions of the robot in map, m.
+    up: the axis of the map that points up.
     """
     begin, end = (float(rays.stamp.min()), float(rays.stamp.max())) if len(rays) else (0.0, 0.0)
     residual_deg = np.degrees(rays.residual)
@@ -110,9 +110,9 @@ def make_cards(
 
 
 def _neighbours(objects: ObjectMap, names: list[str], i: int) -> list[Neighbour]:
-    """Return up to `_NEIGHBOURS` resolved objects with the label of object i, the nearest first. Empty for an unresolved i.
+    """Return up to `_NEIGHBOURS` resolved objects with the label of object i, the nearest first.
 
-    names: the caption of each object.
+    The list is empty if object i is unresolved. names: the caption of each object.
     """
     o = objects[i]
     if o.status != "ok":

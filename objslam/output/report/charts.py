@@ -34,7 +34,7 @@ class Histogram:
 
 
 def histogram(residual: Floats, weight: Floats, bins: int, top: float | None = None) -> Histogram | None:
-    """Count residuals (R,), deg, in bins, used and rejected rays separately. None if no residual is finite.
+    """Return a histogram of residuals (R,), deg, of used and of rejected rays, or None if no residual is finite.
 
     Args:
         weight: (R,) robust weights. A ray with a weight below `REJECTED_BELOW` is rejected.

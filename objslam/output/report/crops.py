@@ -1,4 +1,4 @@
-"""Pictures of the page: crops of chosen boxes, cut from the images of the log."""
+"""Make the pictures of the page. They are crops of chosen boxes from the images of the log."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ from objslam.output.plot.style import REJECTED_BELOW, evenly
 from objslam.sources import SourceOptions, read
 
 _SIDE = 160  # The longer side of a crop on the page, px. A larger value shows more detail, and makes the page larger.
-_MARGIN = 0.2  # A crop has a margin on each side of the box. The margin is this share of the box's longer side.
-_MIN_SIDE = 40  # A crop covers at least this length of the image, px.
+_MARGIN = 0.2  # The margin of a crop on each side of the box, as a share of the box's longer side.
+_MIN_SIDE = 40  # The least side of the part of the image that a crop shows, px.
 _FRAME, _REJECTED_FRAME = (60, 190, 255), (60, 60, 235)
-"""The box is drawn in one of these BGR colours: orange, or red where the ray of the box was rejected."""
+"""The BGR colours of drawn boxes: orange, and red for a box whose ray was rejected."""
 Kind = Literal["best", "worst", "rejected", "unexplained"]
 
 
@@ -41,13 +41,13 @@ class Crop:
 
 
 def images_of(path: object, count: int | None) -> tuple[dict[str, Images], str | None]:
-    """Return the images of a log by camera name, and a sentence that explains why there are no images.
+    """Return the images of a log by camera name, and a sentence with the reason why the log has no images.
 
-    The sentence is None if there are images.
+    The sentence is None if the log has images.
 
     Args:
-        path: the path of the log. A value of another type means that the path is unknown.
-        count: the number of images that the log had at the time of the run; None if this is unknown.
+        path: the path of the log. A value that is neither a str nor a Path means that the path is unknown.
+        count: the number of images that the log had at the time of the run, None if this is unknown.
     """
     if count == 0:
         return {}, "The log of the run had no images."
@@ -68,10 +68,10 @@ def images_of(path: object, count: int | None) -> tuple[dict[str, Images], str |
 
 
 def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
-    """Choose at most `count` of the best used rays of an object, and return their indices.
+    """Return the indices of at most `count` used rays of an object, the best ones.
 
-    The used rays are split into `count` parts in the order of time. The best ray of each part has the highest score. If
-    scores are equal, the largest box decides.
+    The used rays are split into `count` parts in the order of time. The best ray of each part has the highest score. Of
+    equal scores, the ray with the largest box is the best.
 
     Args:
         mine: (M,) the indices of the object's rays, in the order of time.
@@ -85,9 +85,9 @@ def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
 def choose_rays(rays: RaysTable, mine: Ints, count: int) -> dict[int, Kind]:
     """Return the indices of the rays for the pictures of an object, each with its kind.
 
-    best: up to `count` rays of `best_rays`. worst: the other used rays with the largest residuals, in sigmas. rejected:
-    evenly chosen. There are up to half of `count` worst rays, rounded up, and the same number of rejected rays. mine: (M,)
-    the indices of the object's rays, in the order of time.
+    best: up to `count` rays from `best_rays`. worst: the other used rays with the largest residuals, in standard deviations.
+    rejected: rejected rays, evenly chosen. The worst rays are at most half of `count`, rounded up, and so are the rejected
+    rays. mine: (M,) the indices of the object's rays, in the order of time.
     """
     found: dict[int, Kind] = dict.fromkeys(best_rays(rays, mine, count).tolist(), "best")
     few = (count + 1) // 2 if count else 0
@@ -104,9 +104,9 @@ def choose_unexplained(rays: RaysTable, label: str, count: int) -> dict[int, Kin
 
 
 def spread_over_time(rays: RaysTable, mine: Ints, count: int) -> dict[int, Kind]:
-    """Return up to `count` of the rays `mine` (M,), spread over the time.
+    """Return up to `count` of the ray indices `mine` (M,), spread over the time, each with the kind "unexplained".
 
-    The rays are split into `count` parts in the order of time. Each part gives its ray with the highest score.
+    The rays are split into `count` parts in the order of time. The ray with the highest score is taken from each part.
     """
     most = min(count, len(mine))
     parts = np.array_split(mine[np.argsort(rays.stamp[mine], kind="stable")], most) if most else []
@@ -116,10 +116,10 @@ def spread_over_time(rays: RaysTable, mine: Ints, count: int) -> dict[int, Kind]
 def cut_crops(
     rays: RaysTable, chosen: dict[int, Kind], images: dict[str, Images], progress: Callable[[int, int], None]
 ) -> dict[int, Crop]:
-    """Return a crop for each ray whose index is in `chosen`, by this index.
+    """Return the crops of the rays in `chosen`, by the index of the ray.
 
-    A ray has no crop if there is no readable image within `MAX_IMAGE_LAG` of its frame, or if its box is outside the image.
-    progress: a function that gets the number of image files that are done, and the number of all.
+    A ray has no crop if no readable image is within `MAX_IMAGE_LAG` (s) of its frame, or if its box is outside the image.
+    progress: a function that gets the number of image files that are done, and the number of all image files.
     """
     by_file: dict[Path, list[int]] = {}
     for ray in chosen:

@@ -1,4 +1,4 @@
-"""The HTML page of a result folder: this module collects the data, and a template lays them out."""
+"""Make the HTML page of a result folder. This module collects the data, and a template arranges them."""
 
 import json
 from collections.abc import Callable
@@ -38,9 +38,9 @@ from objslam.output.report.scene import scene_data
 from objslam.output.report.site_page import write_site_report
 from objslam.output.report.trends import trends
 
-_BINS = 32  # The number of bars in the histogram of all rays. More bars show more detail, and each has fewer rays.
-_LABELS = 12  # The most labels for which the page shows boxes of no object. More make a list that nobody reads.
-_KNOWN_YAW = 0.999 * UNKNOWN_YAW  # A yaw is unknown if its standard deviation (rad) is at least this.
+_BINS = 32  # The number of bars in the histogram of all rays. More bars show more detail, and each bar has fewer rays.
+_LABELS = 12  # The most labels for which the page shows boxes of no object. A longer list would not be read.
+_KNOWN_YAW = 0.999 * UNKNOWN_YAW  # The standard deviation (rad) from which a yaw counts as unknown.
 _COUNTS = {
     "images": "colour images",
     "detection_frames": "camera frames",
@@ -64,14 +64,14 @@ def write_report(
     images_needed: bool = False,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> Path:
-    """Write report.html into the result folder `out` and return its path. The map of a site gets a page of its own kind.
+    """Write report.html into the result folder `out` and return its path. The map of a site gets another kind of page.
 
     Args:
-        log: the path of the run's log, which has the images for the pictures; by default the path in summary.json.
-        crops: the most pictures of the best boxes of an object, 0 for no pictures. The worst and the rejected boxes of an
-            object get half as many each. The boxes of no object get `crops` for each label.
-        images_needed: whether a log without images is an error. Else the page says why it has no pictures.
-        progress: a function that gets the stage, the steps done and the total number of steps.
+        log: the path of the run's log, which has the images for the pictures. The default is the path in summary.json.
+        crops: the largest number of pictures of the best boxes of an object, 0 for no pictures. The worst boxes and the
+            rejected boxes of an object each get half of this number. The boxes of no object get `crops` for each label.
+        images_needed: whether a log without images is an error. If not, the page states why it has no pictures.
+        progress: a function that gets the name of the stage, the number of steps done and the number of all steps.
     Raises:
         OutputError: the result cannot be read, or the page cannot be written.
         LogError: the ground truth cannot be read, or `images_needed` and there are no images.
@@ -151,17 +151,18 @@ def write_report(
 
 
 def _unexplained(rays: RaysTable, crops: int) -> dict[str, dict[int, Kind]]:
-    """Return the labels with the most boxes of no object, in falling order, each with the rays for its pictures."""
+    """Return the labels with the most boxes of no object, the most frequent first, each with the rays for its pictures."""
     labels, counts = np.unique(rays.label[rays.object < 0].astype(str), return_counts=True)
     most = labels[np.argsort(-counts, kind="stable")][:_LABELS]
     return {str(label): choose_unexplained(rays, str(label), crops) for label in most}
 
 
 def _evaluation(out: Path) -> tuple[dict[int, tuple[float, str]], dict[str, Any] | None]:
-    """Return, by id of each matched object, its error, m, and a text that names its match. Return also evaluation.json.
+    """Return two values: the errors of the matched objects, and the content of evaluation.json.
 
-    If this file does not exist, this function compares the map with the ground truth as `objslam eval` does by default. If
-    there is no ground truth either, there are no errors, and the content is None.
+    The errors map the id of each matched object to its error, m, and a text that names its match. If evaluation.json does
+    not exist, the map is compared with the ground truth as `objslam eval` does by default. Without a ground truth, the
+    errors are empty, and the content is None.
     """
     scores = load_evaluation(out)
     if scores is None:

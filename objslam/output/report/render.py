@@ -27,8 +27,8 @@ def render(template: str, **values: Any) -> str:
 
 @cache
 def _environment() -> jinja2.Environment:
-    """Return the environment of the templates. It keeps compiled templates, because compiling takes most of the time of a
-    small report."""
+    """Return the environment of the templates. The environment is cached with its compiled templates, because compiling
+    takes most of the time of a small report."""
     import jinja2
 
     environment = jinja2.Environment(

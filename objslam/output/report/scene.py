@@ -1,4 +1,4 @@
-"""The data of the 3D view on the page: what scene.js draws, in a frame that has z up."""
+"""Make the data of the 3D view on the page, which scene.js draws. The frame of the view has z up."""
 
 import base64
 from collections.abc import Sequence
@@ -25,8 +25,9 @@ from objslam.output.plot.style import (
 )
 
 _MAX_USED, _MAX_REJECTED = 1500, 300
-"""The most used and the most rejected rays in the view. More make the page larger and the view slower, and hide objects."""
-_MAX_PATH = 1000  # The most poses of a path. More make the page larger, and nobody sees the difference.
+"""The largest numbers of used and of rejected rays in the view. More rays make the page larger and the view slower, and hide
+objects."""
+_MAX_PATH = 1000  # The largest number of poses of a path. More poses make the page larger, without a visible difference.
 
 
 def upright(up: Up) -> Floats:
@@ -42,11 +43,11 @@ def scene_data(
     up: Up,
     colours: Sequence[Colour] | None = None,
 ) -> dict[str, Any]:
-    """Return the data as JSON values. Positions are in the frame of the view, m.
+    """Return the data of the view as JSON values. Positions are in the frame of the view, m.
 
-    The rays, the path and the true path are float32 arrays in base64. A site has neither rays nor a path. "axes" are the
-    map's axes in the frame of the view. truth: the ground truth in the frame of the map. up: the axis of the map that points
-    up. colours: of the objects. The default is the colours of their labels.
+    The rays, the path and the true path are float32 arrays in base64. A site has neither rays nor a path. The value of
+    "axes" is the map's axes in the frame of the view. truth: the ground truth in the frame of the map. up: the axis of the
+    map that points up. colours: the colour of each object. The default is the colour of its label.
     """
     turn = upright(up)
     names, of_label = captions(objects), label_colours(objects)
@@ -80,23 +81,24 @@ def scene_data(
 
 
 def hexadecimal(colour: tuple[float, float, float]) -> str:
-    """Return a colour, r, g, b in [0, 1], as CSS writes it."""
+    """Return a colour, r, g, b in [0, 1], in the form #rrggbb of CSS."""
     return "#" + "".join(f"{round(255 * c):02x}" for c in colour)
 
 
 def _half_axes(objects: ObjectMap, i: int, turn: Floats) -> list[list[float]]:
     """Return the half axes of the 2-sigma ellipsoid of object i, as vectors in the frame of the view, m.
 
-    There are none if the object has no covariance. turn: the rotation of `upright`.
+    The list is empty if the object has no covariance. turn: the rotation from `upright`.
     """
     found = ellipsoid(objects[i])
     return [] if found is None else (turn @ (found[1] * found[0])).T.round(4).tolist()
 
 
 def _body(objects: ObjectMap, i: int, turn: Floats) -> list[list[float]]:
-    """Return half the length, the width and the height of the body of object i, as vectors like in `_half_axes`.
+    """Return half the length, half the width and half the height of the body of object i, as vectors in the frame of the
+    view, m.
 
-    There are none if the object is a point.
+    The list is empty if the object has no body. turn: the rotation from `upright`.
     """
     body = objects[i].body
     if body is None:
@@ -114,9 +116,10 @@ def _thinned(truth: Truth | None, turn: Floats) -> Floats:
 
 
 def _rays(objects: ObjectMap, rays: RaysTable, turn: Floats) -> dict[str, Any]:
-    """Return the rays that the view draws, the used ones first. turn: the rotation of `upright`.
+    """Return the rays that the view draws, the used rays first. turn: the rotation from `upright`.
 
-    rays: both ends of each ray (6 numbers), m. of: the id of the object of each ray. used: the number of used rays.
+    The keys of the result are rays (both ends of each ray, 6 numbers, m), of (the object id of each ray) and used (the
+    number of used rays).
     """
     row = {o.id: i for i, o in enumerate(objects)}
     index = np.array([row.get(int(j), -1) for j in rays.object], dtype=np.int64)

@@ -1,4 +1,4 @@
-"""The HTML page of the map of a site: its sessions, its objects, and what became of each object."""
+"""Make the HTML page of the map of a site. The page shows the sessions, the objects, and the outcome of each object."""
 
 from collections import Counter
 from datetime import UTC, datetime
@@ -16,7 +16,7 @@ from objslam.output.report.scene import hexadecimal, scene_data
 
 
 def write_site_report(out: Path) -> Path:
-    """Write report.html into the folder `out` of a site, and return its path. OutputError if the map cannot be read."""
+    """Write report.html into the folder `out` of a site, and return its path. Raises OutputError if its map is invalid."""
     objects, summary = load_map(out), load_summary(out)
     every = ObjectMap((*objects, *objects.gone))
     colours = [outcome_colour(outcome_of(o)) for o in every]  # As in the picture of the site.
@@ -42,7 +42,7 @@ def write_site_report(out: Path) -> Path:
 
 
 def _date(life: Life | None) -> str:
-    """Return when an object was last updated, as a date or as a stamp, s. The text is empty without a history."""
+    """Return the time of the last update of an object as text, a date or a stamp in s. It is "" if `life` is None."""
     if life is None:
         return ""
     return (

@@ -9,8 +9,8 @@ from objslam.output.plot.style import evenly
 
 WIDTH, HEIGHT = 160.0, 100.0  # The area of a sketch, in units of the drawing.
 _MARGIN = 8.0  # The width of the margin around what is drawn, in units of the drawing.
-_MOST = 40  # The most used and the most rejected rays in a sketch. More rays would merge into one area.
-_BAR = 0.3  # The longest scale bar is this share of the width.
+_MOST = 40  # The largest number of used rays, and of rejected rays, in a sketch. More rays would merge into one area.
+_BAR = 0.3  # The largest length of the scale bar, as a share of the width.
 _ELLIPSE = np.stack([np.cos(t := np.linspace(0, 2 * np.pi, 40, endpoint=False)), np.sin(t)])  # A unit circle.
 _STEPS = (5.0, 2.0, 1.0)  # A scale bar is one of these numbers times a power of ten, m.
 
@@ -19,9 +19,9 @@ _STEPS = (5.0, 2.0, 1.0)  # A scale bar is one of these numbers times a power of
 class Sketch:
     """The rays of an object from above, in units of the drawing.
 
-    used, rejected, path: SVG path data. ellipse: SVG path data of the 2-sigma ellipse, empty without a covariance. dot: the
-    position of the object. others: the positions of the other objects of its label. bar: the length of the scale bar.
-    metres: its length in the map, as text.
+    used, rejected, path: SVG path data of the used rays, the rejected rays and the robot's path. ellipse: SVG path data of
+    the 2-sigma ellipse, empty without a covariance. dot: the position of the object. others: the positions of the other
+    objects of its label. bar: the length of the scale bar. metres: the length of the scale bar in the map, as text.
     """
 
     used: str
@@ -43,14 +43,14 @@ def sketch(
     path: Floats,
     others: Floats,
 ) -> Sketch | None:
-    """Return the sketch of an object. None without a position or without rays. Positions are in a plane seen from above, m.
+    """Return the sketch of an object, or None without a finite position or without rays.
 
     Args:
-        origins, directions: (M, 2) of the rays. A direction is the part of the unit vector in the plane.
-        used: (M,) whether a ray is used. The others are rejected.
-        position: (2,) of the object. covariance: (2, 2), m^2.
-        path: (K, 2) of the robot.
-        others: (N, 2) of the other objects of the label.
+        origins, directions: (M, 2) origins of the rays, m, and the components of their unit vectors in the plane.
+        used: (M,) whether a ray is used. Other rays are rejected.
+        position: (2,) position of the object in the plane seen from above, m. covariance: (2, 2), m^2.
+        path: (K, 2) positions of the robot, m.
+        others: (N, 2) positions of the other objects of the label, m.
     """
     if not np.isfinite(position).all() or not len(origins):
         return None
@@ -95,6 +95,6 @@ def sketch(
 
 
 def _polyline(points: Floats) -> str:
-    """Return SVG path data through points (N, 2). A point far outside the drawing is moved nearer, but stays outside."""
+    """Return SVG path data of a line through points (N, 2). Points far outside are moved nearer, but stay outside."""
     near = np.clip(points, -WIDTH, 2 * WIDTH)
     return "".join(f"{'L' if i else 'M'}{x:.1f} {y:.1f}" for i, (x, y) in enumerate(near.tolist()))

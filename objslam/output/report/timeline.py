@@ -1,4 +1,4 @@
-"""Timelines: when an object was seen, as two paths of an SVG drawing."""
+"""Draw timelines, which show when an object was seen, as two paths of an SVG drawing."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ def timeline(stamps: Floats, used: Bools, begin: float, end: float) -> Timeline:
     """Return the timeline of an object's rays at stamps (M,), s.
 
     used: (M,) whether a ray is used. begin, end: the stamps of the first and the last ray of the result, s. The height of a
-    bar grows with the square root of the number of its rays. Rejected rays stand on top of the used rays.
+    bar grows with the square root of the number of its rays. Rejected rays are drawn above the used rays.
     """
     place = (stamps - begin) / max(end - begin, 1e-9)
     index = np.clip((place * _BINS).astype(int), 0, _BINS - 1)
@@ -34,6 +34,6 @@ def timeline(stamps: Floats, used: Bools, begin: float, end: float) -> Timeline:
 
 
 def _bars(bottom: Floats, height: Floats) -> str:
-    """Return bars as SVG path data. bottom: (_BINS,) the y, downwards, of the lower edges. height: (_BINS,)."""
+    """Return bars as SVG path data. bottom: (_BINS,) y of the lower edges, positive down. height: (_BINS,) of the bars."""
     rows = np.flatnonzero(height > 0).tolist()
     return "".join(f"M{i} {bottom[i]:.1f}v{-height[i]:.1f}h1v{height[i]:.1f}z" for i in rows)

@@ -1,5 +1,7 @@
-"""Charts of the residuals against turn rate, speed and place in the image, which reveal shared errors. The page's template
-draws them in SVG."""
+"""Make charts of the residuals against turn rate, speed and place in the image. They reveal shared errors.
+
+The template of the page draws the charts in SVG.
+"""
 
 from dataclasses import dataclass
 
@@ -11,12 +13,13 @@ from objslam.output.plot.style import REJECTED_BELOW
 from objslam.output.report.charts import HEIGHT, WIDTH, axis_end
 
 _BINS = 12
-"""The most points of a curve. Each point is the median of equally many rays. More points show more detail and more noise."""
+"""The largest number of points of a curve. Each point is the median of the same number of rays. More points show more detail
+and more noise."""
 _FEWEST = 15
-"""The fewest rays of a point. More rays make curves smoother. With 15 rays, the error of a median is about 20 %."""
+"""The least number of rays for a point. More rays make curves smoother. With 15, the error of a median is about 20 %."""
 _HONEST = float(np.sqrt(2 * np.log(2)))
-"""The expected median residual, in standard deviations along one axis, of an error along two axes (Rayleigh). If the median
-residual is larger, the noise is larger than in the settings."""
+"""The expected median residual in standard deviations along one axis. The error has two axes, so it is the median of the
+Rayleigh distribution. If the median residual is larger, the noise is larger than in the settings."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +35,9 @@ class Point:
 class Trend:
     """A chart with curves of the median residual.
 
-    curves: the name and the points of each curve: `before` and `after` the correction of shared errors. `before` is missing
-    if it is unknown. below, beside: position and text of each tick. level: the height of `_HONEST`, None for a chart in
-    degrees.
+    curves: the name and the points of each curve. The names are "before" and "after", for the correction of shared errors.
+    The curve "before" is missing if it is unknown. below, beside: position and text of each tick below and beside the chart.
+    level: the height of `_HONEST`, None for a chart in degrees.
     """
 
     title: str
@@ -46,9 +49,10 @@ class Trend:
 
 
 def trends(rays: RaysTable) -> list[Trend]:
-    """Return the charts of the used rays: in degrees and in sigmas, against turn rate, speed and place in the image.
+    """Return the charts of the used rays, in degrees and in standard deviations, against turn rate, speed and place in the
+    image.
 
-    There is no chart for a quantity that does not vary or has too few rays.
+    A quantity that does not vary or has too few rays has no chart.
     """
     used = (rays.weight >= REJECTED_BELOW) & np.isfinite(rays.residual)
     against = (

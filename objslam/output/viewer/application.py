@@ -1,4 +1,4 @@
-"""The rerun viewer as a separate process: in a window, in a browser, or headless for a screenshot."""
+"""Start the rerun viewer as a separate process: in a window, in a browser, or without a screen for a screenshot."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ Viewer = subprocess.Popen[bytes]
 """The process of a viewer."""
 
 _LOOPBACK = "127.0.0.1"  # Viewers listen at this address. Other machines cannot reach it.
-_PATIENCE = 60.0  # A viewer has this time, s, to start and to load a recording.
-_SETTLE = 1.5  # After a viewer is set to a moment, it has this time, s, to draw. Slower machines need a larger value.
+_PATIENCE = 60.0  # The longest time, s, in which a viewer must start and load a recording.
+_SETTLE = 1.5  # The time, s, in which a viewer draws after its time is set. Slower machines need a larger value.
 _NO_DRIVER = ("render context", "No graphics adapter", "Failed to find a suitable", "NoSuitableAdapter", "adapter was found")
-"""On a machine without a Vulkan driver, the viewer's stderr contains one of these texts."""
+"""Texts in the viewer's stderr on a machine without a Vulkan driver."""
 _NO_SCREEN = ("XOpenDisplay", "neither WAYLAND", "WAYLAND_DISPLAY", "WinitEventLoop", "Failed to open connection")
-"""On a machine without a screen, the viewer's stderr contains one of these texts."""
+"""Texts in the viewer's stderr on a machine without a screen."""
 
 
 def program() -> Path:
-    """Return the viewer's executable; OutputError if rerun was installed without it."""
+    """Return the path of the viewer's executable. Raises OutputError if rerun was installed without the viewer."""
     import rerun_cli
 
     found = Path(rerun_cli.__file__).parent / ("rerun.exe" if os.name == "nt" else "rerun")
@@ -51,7 +51,10 @@ def program() -> Path:
 
 
 def find_rrd(out: Path) -> Path:
-    """Return the recording of a result folder, or `out` if it is a file; OutputError if it is missing or damaged."""
+    """Return the path of the recording. out: the recording itself, or a result folder that contains it.
+
+    Raises OutputError if the recording is missing or damaged.
+    """
     from rerun.chunk import RrdReader
 
     file = out if out.is_file() else out / RECORDING
@@ -109,7 +112,7 @@ def start(*arguments: str) -> Viewer:
 
 
 def show(files: list[Path]) -> None:
-    """Open recordings in the native viewer and wait until it is closed; OutputError if the viewer fails."""
+    """Open recordings in a window of the viewer and wait until it is closed. Raises OutputError if the viewer fails."""
     viewer = start("--port", str(free_port()), *map(str, files))
     try:
         _, said = viewer.communicate()
@@ -120,7 +123,10 @@ def show(files: list[Path]) -> None:
 
 
 def serve(files: list[Path], say: Callable[[str], None]) -> None:
-    """Serve recordings to a browser on this machine until Ctrl+C; `say` receives the address."""
+    """Serve recordings to a browser on this machine until Ctrl+C. say: a function that gets the address as text.
+
+    Raises OutputError if the viewer fails.
+    """
     web, data = free_port(), free_port()
     viewer = start("--serve-web", "--web-viewer-port", str(web), "--port", str(data), *map(str, files))
     try:
@@ -136,10 +142,10 @@ def serve(files: list[Path], say: Callable[[str], None]) -> None:
 def screenshot(
     files: list[Path], picture: Path, size: tuple[int, int] = (1600, 900), at: float = 0.5, timeline: str = STAMP
 ) -> None:
-    """Write a picture of recordings in the layout in which the viewer first opens them. The function needs no screen.
+    """Write a picture of recordings in the layout of the viewer at its start. This function needs no screen.
 
     Args:
-        size: width and height of the picture, points.
+        size: width and height of the picture, in points of the screen.
         at: the time of the picture, as a share of the timeline's length, in [0, 1].
         timeline: the name of the timeline.
     Raises:
@@ -183,7 +189,10 @@ def screenshot(
 
 
 def _retry(viewer: Viewer, attempt: Callable[[], _T | None]) -> _T | None:
-    """Call `attempt` until it returns a value, and return it; None after `_PATIENCE`. OutputError if the viewer ends."""
+    """Call `attempt` until it returns a value, and return this value. Return None after `_PATIENCE`.
+
+    Raises OutputError if the viewer ends.
+    """
     end = time.monotonic() + _PATIENCE
     while time.monotonic() < end:
         if viewer.poll() is not None:
@@ -196,7 +205,7 @@ def _retry(viewer: Viewer, attempt: Callable[[], _T | None]) -> _T | None:
 
 
 def _set_time(client: ViewerClient, share: float, timeline: str) -> None:
-    """Pause the viewer at a moment of a timeline. `share`, in [0, 1], is the part of the timeline before the moment."""
+    """Pause the viewer at a moment of a timeline. share: the part of the timeline before this moment, in [0, 1]."""
     state = client.get_state()
     recording = next((r for r in state.recordings if r.store_id == state.active_recording), state.recordings[0])
     line = next((t for t in recording.timelines if t.name == timeline), None)
@@ -228,7 +237,7 @@ def _failure(code: int | None, said: bytes | None, hint: str | None) -> OutputEr
 
 
 def _wait_for(viewer: Viewer, port: int) -> None:
-    """Wait until a viewer listens on a port; OutputError if it ends or does not answer."""
+    """Wait until a viewer listens on a port. Raises OutputError if the viewer ends or does not answer."""
 
     def attempt() -> bool:
         socket.create_connection((_LOOPBACK, port), timeout=0.5).close()
@@ -240,7 +249,7 @@ def _wait_for(viewer: Viewer, port: int) -> None:
 
 
 def start_listening(port: int, *arguments: str) -> Viewer:
-    """Start a viewer and wait until it listens on a port; OutputError if it ends or does not answer."""
+    """Start a viewer and wait until it listens on a port. Raises OutputError if the viewer ends or does not answer."""
     viewer = start(*arguments)
     _wait_for(viewer, port)
     assert viewer.stderr is not None

@@ -11,7 +11,7 @@ from objslam.output.viewer.view_point import ViewPoint
 
 _ITERATIONS = 4.0  # The number of iterations of the solver that playback shows per second.
 _HIDDEN = ("map/rays/rejected", "map/rays/unexplained", "map/reconstruction/before", "map/doubts")
-"""The entities that are hidden until the user clicks on them. They would hide the map."""
+"""The entities that are invisible until the user clicks on them. If they were visible, they would cover the map."""
 
 
 def blueprint(

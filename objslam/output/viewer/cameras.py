@@ -21,14 +21,14 @@ from objslam.output.viewer.times import moments, stamp_column
 from objslam.output.viewer.view_point import label_rows
 
 _BLOCK = 500_000  # The number of pairs of an object and an image tested at once. A larger value takes more memory.
-_NEAR = 0.2  # The distance, m, below which no camera is expected to see an object.
-_BEYOND = 1.2  # An object is expected in view up to this multiple of its longest used ray.
-_LIGHTER = 0.35  # The share, in [0, 1], by which colours, made for a white page, are lightened for images.
+_NEAR = 0.2  # The least distance, m, at which a camera is expected to see an object.
+_BEYOND = 1.2  # The largest distance at which an object is expected in view, as a multiple of its longest used ray.
+_LIGHTER = 0.35  # The share of white, in [0, 1], that is mixed into colours for images. They are made for a white page.
 _FRUSTUM = 0.05  # The depth of a frustum, as a share of the map's size.
 
 
 def camera_path(camera: Camera) -> str:
-    """Return the entity path of a camera."""
+    """Return the path of the entity of a camera in the recording."""
     return str(rr.new_entity_path(["map", "camera", camera.name])).lstrip("/")
 
 
@@ -36,8 +36,8 @@ def log_cameras(recording: Any, result: RunResult, size: float) -> int:
     """Log each camera as an entity that moves with the robot, `map/camera/NAME`. Return the number of unreadable images.
 
     Below this entity, `image` has the images, `boxes` has the boxes in the colours of their objects, and `map` has the
-    projected objects. Images are scaled down to `output.image_width`, and all pixel coordinates with them. size: the size of
-    the map, m, which sets the depth of the frusta.
+    projected objects. Images and all pixel coordinates are scaled down to the width `output.image_width`. size: the size of
+    the map, m, which determines the depth of the frusta.
     """
     unread = 0
     map_T_camera = result.map_T_base @ result.keyframes.base_T_camera
@@ -62,7 +62,7 @@ def log_cameras(recording: Any, result: RunResult, size: float) -> int:
 
 
 def log_pinhole(recording: Any, path: str, camera: Camera, scale: float, size: float) -> None:
-    """Log the static frustum of a camera. scale: the factor on pixel coordinates. size: of the map, m."""
+    """Log the static frustum of a camera. scale: the factor on pixel coordinates. size: the size of the map, m."""
     matrix = np.diag([scale, scale, 1.0]) @ camera.matrix
     pinhole = rr.Pinhole(
         image_from_camera=matrix,
@@ -78,7 +78,7 @@ def log_pinhole(recording: Any, path: str, camera: Camera, scale: float, size: f
 def _send_images(recording: Any, path: str, stamps: Floats, shown: Ints, images: Iterator[bytes | None]) -> int:
     """Send an image for each stamp with an index in `shown` (n,), and return the number of unreadable images.
 
-    All other stamps get an empty image. An older image would not fit their boxes.
+    All other stamps get an empty image, because an older image would not fit their boxes.
     """
     blobs, counts = [], np.zeros(len(stamps), dtype=np.int64)
     for place, blob in zip(shown.tolist(), images, strict=True):
@@ -147,7 +147,7 @@ def _send_objects(
 
 
 def points_in_frames(camera: Camera, map_T_camera: Floats, points: Floats, farthest: Floats) -> tuple[Ints, Ints, Floats]:
-    """Project points (N, 3), m in map, into images at the camera poses (K, 4, 4), and return the points that are in view.
+    """Project points (N, 3) in map, m, into images at the camera poses (K, 4, 4), and return the points that are in view.
 
     Args:
         farthest: (N,) m, the distance up to which a camera is expected to see each point.

@@ -1,4 +1,4 @@
-"""Doubts in a recording: where objects may be one or two, and where many boxes became no object."""
+"""Log doubts to a recording: objects that may be one object or two, and places of many boxes that became no object."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ _COLOUR = (196, 88, 0)  # The RGB colour of doubts, which no label and no ray ha
 
 
 def log_doubts(recording: Any, result: RunResult) -> None:
-    """Log doubts as static points with captions, `map/doubts`. Lines join two objects that may be one,
+    """Log doubts as static points with captions to `map/doubts`. Log lines between two objects that may be one to
     `map/doubts/pairs`."""
     placed = [(one, one.position) for one in result.doubts if one.position is not None]
     if placed:
@@ -28,7 +28,7 @@ def log_doubts(recording: Any, result: RunResult) -> None:
 
 
 def caption(doubt: Doubt) -> str:
-    """Return a few words that say what a doubt is."""
+    """Return a short text that describes a doubt."""
     boxes = len(doubt.rays) or int(doubt.numbers.get("boxes_cut_off", 0))
     number = f"{boxes} " if doubt.kind == "boxes" else ""
     return printable(f"{number}{doubt.label}: {doubt.reason}")

@@ -1,4 +1,4 @@
-"""The texts of a recording: events of the drive, changes of each round, changes of a live map, and a table of the run."""
+"""Make the texts of a recording: events of the drive, changes of each round or of a live map, and a table of the run."""
 
 import re
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ from objslam.mapping.doubts.words import why_unresolved
 from objslam.output.plot.style import captions, ray_kinds
 
 Level = Literal["INFO", "WARN"]
-_MAX_CHANGES = 40  # The most changes of objects that the log lists for a round.
-_MERGED = 0.5  # A dropped object counts as merged if another object of its label is within this distance, m.
+_MAX_CHANGES = 40  # The largest number of changes of objects that the log lists for a round.
+_MERGED = 0.5  # The distance, m, below which a dropped object counts as merged into another object of its label.
 _WHY = {
     "fixed": "association at the fixed poses",
     "labels": "one object assumed for each label",
@@ -49,7 +49,7 @@ class Event:
 
 
 def drive_events(result: RunResult) -> list[Event]:
-    """Return the events of a drive: first events of the whole run, then events of objects in the order of time."""
+    """Return the events of a drive. Events of the whole run come first. Events of objects follow in the order of time."""
     start = float(result.keyframes.stamps[0])
     resolved = len(result.map.resolved())
     objects = f"{resolved} objects, {len(result.map) - resolved} unresolved"
@@ -80,8 +80,8 @@ def drive_events(result: RunResult) -> list[Event]:
 def _enough_parallax(result: RunResult) -> Floats:
     """Return the stamp (N,), s, at which each object first has enough parallax.
 
-    At this stamp, a used ray first has an angle of at least `triangulation.min_parallax_deg` to the earliest used ray. NaN
-    if there is none.
+    At this stamp, a used ray first has an angle of at least `triangulation.min_parallax_deg` to the earliest used ray. The
+    stamp of an object without such a ray is NaN.
     """
     stamps = np.full(len(result.map), np.nan)
     used = np.flatnonzero(ray_kinds(result)["used"])
@@ -100,7 +100,8 @@ def _enough_parallax(result: RunResult) -> Floats:
 
 
 def round_events(trace: tuple[Round, ...], label_names: tuple[str, ...]) -> list[Event]:
-    """Return the events of all rounds: changes at a round's first iteration, and the result of its solve at the last."""
+    """Return the events of all rounds. The changes of a round are at its first iteration, and the result of its solve is at
+    its last iteration."""
     events: list[Event] = []
     at, before = 0, None
     for number, r in enumerate(trace):
@@ -127,7 +128,7 @@ def round_events(trace: tuple[Round, ...], label_names: tuple[str, ...]) -> list
 def _changes(before: Round | None, now: Round, label_names: tuple[str, ...]) -> list[str]:
     """Return a text for each object that is new, merged or dropped since the round `before`.
 
-    An object of the earlier round continues as the object that now has most of its rays.
+    An object of the earlier round is the same as the object that now has most of its rays.
     """
     names = [f"{label_names[k]} #{j}" for j, k in enumerate(now.association.label.tolist())]
     rays = np.bincount(now.association.object[now.association.object >= 0], minlength=now.association.count)
@@ -157,7 +158,7 @@ def _changes(before: Round | None, now: Round, label_names: tuple[str, ...]) -> 
 
 
 def map_changes(before: ObjectMap, now: ObjectMap) -> list[tuple[Level, str]]:
-    """Return level and text of each change of a live map: an object is new, resolved, unresolved, renamed or dropped."""
+    """Return level and text of each change of a live map. An object is new, resolved, unresolved, renamed or dropped."""
     old, new = ({o.id: o for o in m.objects} for m in (before, now))
     lines: list[tuple[Level, str]] = []
     for j, o in new.items():
@@ -214,5 +215,5 @@ def table(rows: list[tuple[str, str]]) -> list[str]:
 
 
 def markdown(text: str) -> str:
-    """Return a text as one line of Markdown that shows the text itself, and no link, image, HTML or table cell."""
+    """Return a text as one line of Markdown. Special characters are escaped, so that they make no link, image or HTML."""
     return re.sub(r"([\\`*_\[\]<>|!~#&])", r"\\\1", one_line(text))

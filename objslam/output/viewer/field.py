@@ -1,4 +1,4 @@
-"""A recording of the proximity field of one object: the cost of Eq. 1 on two slices, its minimum, and the rays."""
+"""Make a recording of the proximity field of one object: the cost of Eq. 1 on two slices, its minimum, and the rays."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from objslam.triangulation.proximity_field import ProximityField, main_heading, 
 if TYPE_CHECKING:
     from objslam.io.rays_parquet import RaysTable
 
-_MAX_RAYS = 160  # The recording shows at most this many rays of each kind, evenly chosen.
-_FROM = np.array([0.62, -0.62, 0.55])  # The view point lies in this direction, in the axes of the slices: ahead, left, up.
-_DISTANCE = 4.2  # The view point lies at this distance, as a multiple of half a slice's edge.
+_MAX_RAYS = 160  # The largest number of rays of each kind in the recording, evenly chosen.
+_FROM = np.array([0.62, -0.62, 0.55])  # The direction of the view point from the minimum, in the axes ahead, left and up.
+_DISTANCE = 4.2  # The distance of the view point, as a multiple of half the edge of a slice.
 _TEXT, _ESTIMATE, _MINIMUM = (255, 255, 255), (40, 44, 52), (90, 255, 120)  # The RGB colours: white, nearly black, green.
 _HIDDEN = ("map/objects/labels", "map/objects/extent", "map/rays", "map/reconstruction")
-"""The viewer hides these entities of the run until the user clicks on them, because they would hide the field."""
+"""The entities of the run that are invisible until the user clicks on them. If visible, they would cover the field."""
 
 
 def write_field(out: Path, number: int, file: Path) -> ProximityField:
     """Write a recording of the run with the proximity field of one object, and return the field.
 
-    If the run wrote no recording, the new recording has the map and the field only.
+    If the run wrote no recording, the new recording has only the map and the field.
 
     Args:
         out: the result folder.
@@ -119,7 +119,8 @@ def _log_rays(recording: Any, rays: RaysTable, pull: Bools, rejected: Bools, f: 
 
 
 def _log_marks(recording: Any, f: ProximityField, o: MapObject, name: str, view_point: ViewPoint) -> None:
-    """Log two labelled points: the minimum of Eq. 1, `map/field/minimum`, and the run's estimate, `map/field/estimate`."""
+    """Log two points with labels: the minimum of Eq. 1 to `map/field/minimum`, and the run's estimate to
+    `map/field/estimate`."""
     size = float(np.ptp(f.vertical.points[..., 2]))
     nearer = -0.03 * size * view_point.axes[2]  # The labels lie in front of the vertical slice.
     for path, place, label, colour, lift in (

@@ -1,4 +1,4 @@
-"""Camera images for a recording: a limited number of small JPEGs, which threads read ahead."""
+"""Make the camera images of a recording: a limited number of small JPEGs, which threads read in advance."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,11 +17,11 @@ from objslam.output.plot.style import evenly
 
 _MAX_LAG = 0.05  # The longest time, s, between a keyframe and its image.
 _QUALITY = 70  # The quality of JPEGs, 0 to 100. A larger value makes larger recordings.
-_AHEAD = 8  # The number of images that threads read ahead. A larger value takes more memory.
+_AHEAD = 8  # The number of images that threads read in advance. A larger value takes more memory.
 
 
 def choose_images(images: Images, stamps: Floats, most: int) -> tuple[Ints, Ints]:
-    """Choose at most `most` of the stamps (N,), s, that have an image, evenly spread.
+    """Choose at most `most` of the stamps (N,), s, that have an image within `_MAX_LAG`, evenly spread.
 
     Return the indices (n,) of these stamps and the indices (n,) of their images.
     """
@@ -65,7 +65,8 @@ def _read(path: Path) -> NDArray[np.uint8] | None:
 
 
 def pack(pixels: np.ndarray, size: tuple[int, int] | None = None) -> bytes:
-    """Encode an image (H, W, 3), uint8 BGR, or (H, W) as a JPEG. It is scaled to `size` (width, height), px, if given."""
+    """Return an image (H, W, 3), uint8 BGR, or (H, W) as a JPEG. size: the width and height of the JPEG, px. None keeps the
+    size of the image."""
     import cv2
 
     if size is not None and (pixels.shape[1], pixels.shape[0]) != size:

@@ -1,4 +1,4 @@
-"""Objects in a recording: points, labels, covariance ellipsoids, boxes, and a line for each unresolved object."""
+"""Log objects to a recording: points, labels, covariance ellipsoids, boxes, and a line for each unresolved object."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from objslam.errors import printable
 from objslam.output.plot.style import DrawnShape, captions, drawn_shape, ellipsoid, object_colours
 from objslam.output.viewer.view_point import ViewPoint, label_places
 
-_MAX_LABELS = 60  # The most objects of a map whose labels show at first. More labels would overlap.
+_MAX_LABELS = 60  # The largest number of objects of a map whose labels are visible at first. More labels would overlap.
 _OPACITY = 90  # The opacity of bodies, 0 to 255. More opaque bodies hide the points and ellipsoids inside them.
 _AXES = ((220, 50, 47), (70, 160, 60), (40, 110, 220))  # The RGB colours of the axes x, y and z.
 _TRUTH, _TEXT, _LEADER = (0, 0, 0), (255, 255, 255), (170, 170, 170)  # The RGB colours are black, white, grey.
@@ -87,7 +87,7 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
 
 
 def _log_bodies(log: Any, bodies: list[tuple[Floats, Body, tuple[int, int, int]]]) -> None:
-    """Log bodies, filled, in the shapes in which pictures show them. The 2-sigma ellipsoids are lines."""
+    """Log bodies as filled shapes (`drawn_shape`). The 2-sigma ellipsoids, in contrast, are lines."""
     shapes: tuple[DrawnShape, ...] = ("ellipsoid", "cuboid", "cylinder")
     for shape in shapes:
         some = [one for one in bodies if drawn_shape(one[1]) == shape]
@@ -107,7 +107,7 @@ def _log_bodies(log: Any, bodies: list[tuple[Floats, Body, tuple[int, int, int]]
 
 
 def _log_tags(log: Any, tags: list[tuple[Floats, TagPose, tuple[int, int, int]]]) -> None:
-    """Log the outlines of fiducials at places, and three arrows as long as their side: x red, y green, z blue."""
+    """Log the outlines of fiducials, and three arrows with the length of their side: x red, y green, z blue."""
     outlines = [tag.outline(place) for place, tag, _ in tags]
     log("/tags", rr.LineStrips3D(outlines, colors=[c for *_, c in tags], radii=rr.Radius.ui_points(1.5)), bool(tags))
     axes = rr.Arrows3D(

@@ -1,4 +1,4 @@
-"""Paths, the robot on its path, and the estimate after each iteration of the solver."""
+"""Log paths, the robot on its path, and the estimate after each iteration of the solver to a recording."""
 
 from typing import Any
 
@@ -15,9 +15,9 @@ from objslam.output.viewer.times import iteration_column, stamp_column
 
 _BEFORE, _AFTER, _TRUTH = (150, 150, 150), (40, 44, 52), (46, 139, 87)  # The RGB colours are grey, nearly black, green.
 _STEP = (240, 140, 40)  # The colour of the path of an iteration (RGB): orange, unlike the static paths.
-_MAX_POINTS = 4000  # The most points of a static path. A screen cannot resolve more.
-_MAX_STEP_POINTS = 400  # The most points of the path of an iteration.
-_MAX_STEPS = 400  # The most iterations in a recording, evenly chosen.
+_MAX_POINTS = 4000  # The largest number of points of a static path. A screen cannot resolve more points.
+_MAX_STEP_POINTS = 400  # The largest number of points of the path of an iteration.
+_MAX_STEPS = 400  # The largest number of iterations in a recording, evenly chosen.
 
 
 def log_paths(recording: Any, result: RunResult, truth: Truth | None) -> None:

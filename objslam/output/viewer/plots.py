@@ -1,4 +1,4 @@
-"""Curves: residuals and ray counts by stamp, cost and object counts by iteration, and the time of each stage."""
+"""Log curves: residuals and ray counts by stamp, cost and object counts by iteration, and the time of each stage."""
 
 from typing import Any
 
@@ -13,8 +13,8 @@ from objslam.output.viewer.rays import RAY_COLOURS
 from objslam.output.viewer.times import iteration_column, stamp_column
 
 _GAP, _GAP_STEPS = 1.0, 5.0
-"""A pause breaks a curve if it is longer than `_GAP`, s, and longer than `_GAP_STEPS` times the median step between stamps.
-Larger values break curves more rarely."""
+"""The limits for a gap in a curve. A pause is a gap if it is longer than `_GAP` (s) and than `_GAP_STEPS` times the median
+step between stamps. Larger values make fewer gaps."""
 _BLUE, _ORANGE, _GREEN, _GREY = (62, 128, 214), (240, 150, 50), (90, 170, 90), (120, 120, 120)  # RGB, of curves.
 _MANY = (
     *(_BLUE, _ORANGE, _GREEN, (190, 70, 70), (140, 90, 190), (140, 100, 80)),
@@ -81,7 +81,7 @@ def log_parameters(recording: Any, result: RunResult) -> None:
     found = result.calibration
     rows.append((max(at - 1, 0), Parameters(found.names, found.values, found.sigma)))
     for i, name in enumerate(found.names):
-        # A solve may have had fewer errors than the last one, which estimates an error that was held before.
+        # An earlier solve may have had fewer shared errors than the last one.
         steps = [(number, row, row.names.index(name)) for number, row in rows if name in row.names]
         numbers = np.array([number for number, _, _ in steps])
         begun = np.append(max(numbers[0] - 1, 0), numbers)

@@ -1,4 +1,4 @@
-"""Rays in a recording: used rays are blue, rejected rays are red, and unexplained rays are grey."""
+"""Log rays to a recording. Used rays are blue, rejected rays are red, and unexplained rays are grey."""
 
 from typing import Any
 
@@ -15,8 +15,8 @@ _Palette = dict[RayKind, tuple[int, int, int]]
 RAY_COLOURS: _Palette = {"used": (62, 128, 214), "rejected": (224, 62, 50), "unexplained": (150, 150, 150)}
 """The RGB colour of each kind of ray."""
 _FAINT: _Palette = {"used": (186, 212, 243), "rejected": (246, 205, 200), "unexplained": (222, 222, 222)}
-"""The RGB colour of each kind of static ray: `RAY_COLOURS` with about two thirds of white."""
-_MAX_RAYS = 240  # The most static rays of each kind. Lines are opaque, so more would hide the map.
+"""The RGB colour of each kind of static ray. It is the colour in `RAY_COLOURS` with about two thirds of white."""
+_MAX_RAYS = 240  # The largest number of static rays of each kind. Lines are opaque, so more rays would cover the map.
 
 
 def log_rays(recording: Any, result: RunResult) -> None:

@@ -33,7 +33,7 @@ def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -
     `map` (m) has the static data: paths, objects, ground truth, a sample of the rays, surfaces. On the timeline
     `stamp`, `map` also has the robot, its cameras with images, boxes and objects, and the rays of each stamp. On the
     timeline `iteration`, `map` has the path and the objects after each iteration of the solver. `plots` has curves, `log`
-    has the events on both timelines, and `summary` has a table. OSError if the file cannot be written.
+    has the events on both timelines, and `summary` has a table. Raises OSError if the file cannot be written.
     """
     recording = rr.RecordingStream("objslam")
     # The recording is kept in memory until the end, because a file sink does not raise an error on a full disk.

@@ -8,12 +8,12 @@ import rerun as rr
 from objslam.core.result import RunResult, Surface
 
 _MAX_VERTICES = 100_000  # The most vertices of a recorded surface, 5 MB. reconstruction.ply has all vertices.
-_CELL = 0.02  # The first edge length, m, of the grid cells.
+_CELL = 0.02  # The edge length, m, from which the grid cells grow. The first cells have `_GROWTH` times this length.
 _GROWTH = 1.25  # The factor by which cells grow until at most `_MAX_VERTICES` vertices are left.
 
 
 def log_surfaces(recording: Any, result: RunResult) -> None:
-    """Log static surfaces in `map/reconstruction`: `after` the estimation of the poses, and `before` it, if they exist.
+    """Log the static surfaces `after` and `before` the estimation of the poses, if they exist, to `map/reconstruction`.
 
     Only the front of a wall is drawn, so that walls near the view point do not hide the room.
     """
@@ -32,7 +32,8 @@ def log_surfaces(recording: Any, result: RunResult) -> None:
 
 
 def coarser(surface: Surface, most: int) -> Surface:
-    """Reduce a surface to at most `most` vertices. Vertices in one grid cell become their mean (Rossignac & Borrel 1993)."""
+    """Return a surface with at most `most` vertices. The vertices in a grid cell become their mean (Rossignac & Borrel
+    1993)."""
     cell = _CELL
     while len(surface.vertices) > most:
         cell *= _GROWTH

@@ -7,11 +7,11 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 from objslam.core.validity import is_date
 
-STAMP, ITERATION = "stamp", "iteration"  # The timelines of the drive and of the solver.
+STAMP, ITERATION = "stamp", "iteration"  # The names of the timelines of the drive and of the solver.
 
 
 def stamp_column(stamps: Floats) -> Any:
-    """Make a column of the timeline `stamp` from stamps (N,), s. Unix times become dates, all other stamps durations."""
+    """Return a column of the timeline `stamp` from stamps (N,), s. Unix times become dates, other stamps durations."""
     import rerun as rr
 
     if len(stamps) and is_date(float(stamps[0])):
@@ -27,7 +27,7 @@ def iteration_column(numbers: Ints) -> Any:
 
 
 def moments(stamps: Floats, of: Ints) -> tuple[Floats, Ints, Ints]:
-    """Group items by their stamp. A stamp without items is kept, so that the viewer shows no older items there.
+    """Group items by their stamp. A stamp without items is kept, so that the viewer shows no older items at this stamp.
 
     Args:
         stamps: (K,) s, ascending.

@@ -1,4 +1,4 @@
-"""The first view of a map, and the placement of labels on the map and in camera images."""
+"""Choose the first view of a map, and place labels on the map and in camera images."""
 
 from dataclasses import dataclass
 
@@ -14,12 +14,12 @@ from objslam.output.plot.style import frame_objects
 _FOV = np.radians(55.0)  # The vertical field of view of the viewer, rad.
 _VIEW = np.array([900.0, 620.0])  # The width and height of the view of the map, px, in a window of 1600 x 900.
 _FILLED = 0.86  # The share of the view that the map fills.
-_FROM = np.array([-0.28, -0.80, 0.78])  # The direction of the first view point: south, slightly west, 43 deg up.
+_FROM = np.array([-0.28, -0.80, 0.78])  # The direction of the first view point from the map: -y, slightly -x, 43 deg up.
 _LINE = 24.0  # The height of a label on the map, px.
-_LETTER, _PADDING = 7.3, 12.0  # The width of a letter, and the width of both margins of a label, px on the screen.
+_LETTER, _PADDING = 7.3, 12.0  # The width of a letter, and the sum of both margins of a label, px on the screen.
 _IMAGE_LINE = 21.0  # The height of a label in an image, px on the screen.
 _IMAGE_VIEW = (580.0, 350.0)  # The width and height of the view of a camera, px, in a window of 1600 x 900.
-_ROWS = 6  # The most rows between a dot and its label.
+_ROWS = 6  # The number of rows below a dot in which its label may be.
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class ViewPoint:
 
 
 def first_view_point(objects: ObjectMap, path: Floats, up: Up = "z") -> ViewPoint:
-    """Return the view point from which the objects and the path (K, 3) fill the view. Far objects do not count.
+    """Return the view point from which the objects and the path (K, 3), m, fill the view. Far objects are ignored.
 
     up: the axis of the map that points up.
     """
@@ -65,7 +65,7 @@ def first_view_point(objects: ObjectMap, path: Floats, up: Up = "z") -> ViewPoin
     back = _FROM @ np.stack([*np.eye(3)[from_above(up)], up_vector(up)])
     axes = _axes(back, up_vector(up))
     tangent = _FILLED * np.tan(_FOV / 2) * np.array([_VIEW[0] / _VIEW[1], 1.0])
-    for _ in range(4):  # Perspective enlarges the near half. So the target moves to the centre step by step.
+    for _ in range(4):  # Perspective enlarges the near half of the map, so the target moves to the centre in steps.
         x, y, ahead = ((points - centre) @ axes.T).T
         distance = max(float(np.max(np.abs(x) / tangent[0] - ahead)), float(np.max(np.abs(y) / tangent[1] - ahead)), 1.0)
         seen = np.column_stack([x, y]) / np.maximum(distance + ahead, 1e-6)[:, None]
@@ -114,7 +114,7 @@ def label_places(view_point: ViewPoint, anchors: Floats, texts: list[str], avoid
 
 
 def label_rows(frame: Ints, dots: Floats, letters: Ints, size: tuple[float, float]) -> tuple[Floats, Bools]:
-    """Place labels in the rows of their images, from left to right. Each label gets the first free row below its dot.
+    """Place labels in rows of their images, from left to right. Each label gets the first free row below its dot.
 
     Args:
         frame: (S,) the image of each dot.

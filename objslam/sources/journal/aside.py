@@ -1,4 +1,4 @@
-"""Set the journal of an earlier session aside, and put it back if the new session gets no message."""
+"""Rename the journal of an earlier session, and restore its name if the new session gets no message."""
 
 import itertools
 import re
@@ -13,11 +13,11 @@ from objslam.sources.journal.segments import holds_messages
 
 
 def set_aside(file: Path) -> Path | None:
-    """Rename the journal `file` so that a new one can be written, and return its new path.
+    """Rename the journal `file`, so that a new journal can be written, and return the new path of the old journal.
 
-    The new name has the first free number: journal.1.objslam. If there is no journal, or one without messages, nothing is
-    renamed and None is returned.
-    Raises OutputError if another session writes the journal, the file is not a journal, or it cannot be renamed.
+    The new name has the first free number, for example journal.1.objslam. If there is no journal, or if it has no messages,
+    nothing is renamed and None is returned. Raises OutputError if another session writes the journal, if the file is not a
+    journal, or if the file cannot be renamed.
     """
     with refusals("set the journal aside", file):
         if not file.is_file():
@@ -36,9 +36,9 @@ def set_aside(file: Path) -> Path | None:
 
 
 def put_back(aside: Path, file: Path) -> bool:
-    """Rename `aside`, a journal that `set_aside` renamed, back to `file`. Returns whether it was renamed.
+    """Rename `aside`, a journal that `set_aside` renamed, back to `file`. Return whether `aside` was renamed.
 
-    If `file` is by now a journal with messages, nothing is renamed. Raises OutputError if the journal cannot be renamed.
+    Nothing is renamed if `file` is now a journal with messages. Raises OutputError if the journal cannot be renamed.
     """
     with refusals(f"put {aside} back", file):
         if file.is_file():
@@ -52,10 +52,10 @@ def put_back(aside: Path, file: Path) -> bool:
 def restore_after_kill(file: Path) -> Path | None:
     """Put back the newest journal that was set aside, if `file` is the empty journal of a session that was killed.
 
-    A session sets the earlier journal aside before its own first message. If it is killed before that message, it leaves an
-    empty journal, and a resumed session would start from nothing. Returns the path from which the journal came, None if
-    nothing was renamed. If another session has the empty journal open, nothing is renamed. Raises OutputError if the journal
-    cannot be renamed.
+    A session sets the earlier journal aside before its own first message. A session that is killed before this message
+    leaves an empty journal, and a resumed session would start from nothing. Return the old path of the journal that was put
+    back, or None if nothing was renamed. Nothing is renamed if another session has the empty journal open. Raises
+    OutputError if the journal cannot be renamed.
     """
     numbered = re.compile(rf"{re.escape(file.stem)}\.[0-9]+{re.escape(file.suffix)}")
     with refusals("put an earlier journal back", file):
@@ -77,7 +77,7 @@ def restore_after_kill(file: Path) -> Path | None:
 
 @contextmanager
 def refusals(action: str, file: Path) -> Iterator[None]:
-    """Turn an OSError in the block into the OutputError "cannot ACTION: REASON" at `file`."""
+    """Turn an OSError in the block into the OutputError "cannot ACTION: REASON", which names `file`."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""What a live session found itself, and then corrected in its map, and its encoding as bytes for the journal."""
+"""The corrections that a live session found itself and made in its map, and their encoding as bytes for the journal."""
 
 import json
 from collections.abc import Callable
@@ -22,7 +22,7 @@ _OF_LOCALIZATION = ("heading", "heading_share", "heading_seconds", "place", "pla
 class CalibrationMessage:
     """The shared errors that a session corrects in its map and in all later messages, and the noise of its localisation.
 
-    keyframe: the number of keyframes in the map before the correction. noise: only the fields `_OF_LOCALIZATION` count.
+    keyframe: the number of keyframes in the map before the correction. noise: only its fields `_OF_LOCALIZATION` are used.
     """
 
     keyframe: int
@@ -32,11 +32,12 @@ class CalibrationMessage:
 
 @dataclass(frozen=True)
 class BodiesMessage:
-    """The bodies of n landmarks, to whose centres a session turns its bearings.
+    """The bodies of n landmarks. A session corrects its bearings so that they point to the centres of the bodies.
 
-    keyframe: the number of keyframes in the map before the correction. ids: (n,) of the landmarks. shape: (n,) index into
-    `SHAPES`, 0 for a landmark whose bearings stay at the centres of its boxes. half: (n, 3) m, the half axes along the yaw,
-    across it and upwards. yaw: (n,) rad in the map of the session. covariance: (n, 4, 4) of the half axes and the yaw.
+    keyframe: the number of keyframes in the map before the correction. ids: (n,) ids of the landmarks. shape: (n,) index
+    into `SHAPES`, 0 for a landmark whose bearings stay at the centres of its boxes. half: (n, 3) half axes along the yaw,
+    across the yaw and upwards, m. yaw: (n,) rad, in the map of the session. covariance: (n, 4, 4) covariance of the three
+    half axes and the yaw, in m and rad.
     """
 
     keyframe: int
@@ -49,12 +50,12 @@ class BodiesMessage:
 
 @dataclass(frozen=True)
 class AssociationMessage:
-    """Which rays of a session are of which object, and its path, as an association of the whole drive found them.
+    """The object of each ray of a session, and the path of the session. An association of the whole drive found both.
 
-    keyframe: the number of keyframes in the map before the correction. rays: for each of N objects, the numbers (n,) of its
-    rays, in order. positions: (N, 3) m, of the objects. free: (n,) the numbers of the rays that are of no object, in order.
-    No ray is in two of these arrays. keyframes: (K,) the ids of the keyframes. map_T_camera: (K, 4, 4) their poses, in a map
-    that may be another than the session's.
+    keyframe: the number of keyframes in the map before the correction. rays: for each of N objects, the increasing numbers
+    (n,) of its rays. positions: (N, 3) positions of the objects, m. free: (n,) increasing numbers of the rays of no object.
+    No ray number occurs twice in `rays` and `free`. keyframes: (K,) ids of the keyframes. map_T_camera: (K, 4, 4) poses of
+    the keyframes. Their frame map may differ from the map of the session.
     """
 
     keyframe: int
@@ -67,10 +68,10 @@ class AssociationMessage:
 
 @dataclass(frozen=True)
 class NamesMessage:
-    """What the labels of a session are. A label in none of the arrays, which have no label in common, stays what it is.
+    """The kinds of the labels of a session. A label is in at most one of the arrays. A label in no array keeps its kind.
 
-    keyframe: the number of keyframes in the map before the correction. names: (n,) the numbers of the labels that name one
-    object. several: (m,) of the labels with several objects. moving: (k,) of the labels of things that move.
+    keyframe: the number of keyframes in the map before the correction. names: (n,) numbers of the labels that name a single
+    object. several: (m,) numbers of the labels of several objects. moving: (k,) numbers of the labels of things that move.
     """
 
     keyframe: int
@@ -80,11 +81,11 @@ class NamesMessage:
 
 
 Correction = CalibrationMessage | BodiesMessage | AssociationMessage | NamesMessage
-"""What a session found itself, and then corrected in its map."""
+"""A correction that a session found itself and made in its map."""
 
 
 def encode_correction(message: Correction) -> bytes:
-    """Encode a correction. One of `CORRECTION_READERS` returns the same correction, bit for bit."""
+    """Return a correction as bytes. The reader in `CORRECTION_READERS` returns the same correction, bit for bit."""
     if isinstance(message, CalibrationMessage):
         found = message.calibration
         numbers = [array.tolist() for array in (found.values, found.covariance, found.prior)]
@@ -114,7 +115,7 @@ def _read_calibration(data: bytes) -> CalibrationMessage:
 
 
 def _noise(values: list[float] | None = None) -> NoiseFactors:
-    """Return the noise of a localisation. Journals of older versions have none."""
+    """Return the noise of the localisation. Journals of older versions have no `values`, which gives `NOMINAL`."""
     if values is None:
         return NOMINAL
     noise = dict(zip(_OF_LOCALIZATION, as_array(values, (len(_OF_LOCALIZATION),)).tolist(), strict=True))
@@ -171,4 +172,4 @@ CORRECTION_READERS: dict[bytes, Callable[[bytes], Correction]] = {
     _ASSOCIATION_KIND: _read_association,
     _NAMES_KIND: _read_names,
 }
-"""The reader of each kind of correction, by the first byte of its record."""
+"""The function that reads each kind of correction. The key is the first byte of the record."""

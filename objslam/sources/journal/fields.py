@@ -1,4 +1,4 @@
-"""The fields of journal records, with the limits that a live session puts on them."""
+"""Read the fields of journal records, and refuse the values that a live session would refuse."""
 
 import numpy as np
 
@@ -7,14 +7,14 @@ from objslam.core.validity import is_name, rigid_pose, valid_stamps
 
 
 def as_stamp(value: float) -> float:
-    """Return a stamp, s. Raises ValueError if no session accepts it."""
+    """Return a stamp, s. Raises ValueError if the stamp is not finite or too large."""
     if not valid_stamps(np.array(value, dtype=np.float64)):
         raise ValueError("a stamp is not finite or too large")
     return float(value)
 
 
 def as_name(value: object) -> str:
-    """Return a name. Raises ValueError if it is empty or not printable."""
+    """Return a name. Raises ValueError if the name is empty or not printable."""
     if not is_name(value):
         raise ValueError("a name that is empty or not printable")
     return str(value)
@@ -28,7 +28,7 @@ def as_count(value: object) -> int:
 
 
 def as_pose(values: list[float]) -> Floats:
-    """Return a pose (4, 4) of 16 numbers. Raises ValueError if it is not rigid, or too far away."""
+    """Return the pose (4, 4) of 16 numbers. Raises ValueError if the pose is not rigid or too far away."""
     pose = rigid_pose(as_array(values, (4, 4)))
     if pose is None:
         raise ValueError("a pose that is not rigid, or too far away")
@@ -36,7 +36,7 @@ def as_pose(values: list[float]) -> Floats:
 
 
 def as_array(values: list[float], shape: tuple[int, ...]) -> Floats:
-    """Return an array of this shape. Raises ValueError if the numbers do not fit, or are not finite."""
+    """Return the numbers as an array of this shape. Raises ValueError if their count is wrong or a number is not finite."""
     found = np.array(values, dtype=np.float64).reshape(shape)
     if not np.isfinite(found).all():
         raise ValueError("a number is not finite")

@@ -1,8 +1,8 @@
-"""Write the journal: the files with all messages that a live session accepted.
+"""Write the journal of a live session. Its files have all messages that the session accepted.
 
 A message is accepted only when its record is in the kernel's cache, so a killed process loses no accepted message. The
 record is on the disk about 1 s later (`_SYNC_EVERY`), so a power failure loses the messages of about 1 s. If the disk is
-nearly full or fails, or the file is deleted, the journal warns and stops. The session goes on without it.
+nearly full or fails, or the file is deleted, the journal warns and stops. The session goes on without the journal.
 """
 
 import os
@@ -31,16 +31,20 @@ from objslam.sources.journal.records import Message, encode, encode_stop
 from objslam.sources.journal.segments import compress, identity_of, new_file, seal, uncompressed_segments
 
 _SYNC_EVERY = 1.0  # The time between two syncs to the disk, s. With a larger value, a power failure loses more messages.
-_EARLY = 2.0  # A warning comes at this many times the free space at which the journal stops. A larger value warns earlier.
-_SMALL = 0.02  # The largest share of the disk that the journal leaves free. A larger share stops it earlier on a small disk.
+_EARLY = 2.0
+"""The free space at which a warning comes, as a multiple of the free space at which the journal stops. A larger value warns
+earlier."""
+_SMALL = 0.02
+"""The largest share of the disk that the journal leaves free. With a larger share, the journal stops earlier on a small
+disk."""
 _MB = 1_000_000
 
 
 class Journal:
-    """A journal open for writing. Only one process may write it.
+    """A journal that is open for writing. Only one process may write to it.
 
-    torn: how many bytes behind the last undamaged record were removed from a resumed journal. 0 for a new journal.
-    stopped: why nothing is written any more, None as long as messages are written.
+    torn: the number of bytes after the last undamaged record that were removed from a resumed journal. It is 0 for a new
+    journal. stopped: the reason why the journal stopped. It is None as long as messages are written.
     """
 
     def __init__(
@@ -54,11 +58,11 @@ class Journal:
     ) -> None:
         """Open a new journal. With `resume`, open an existing journal to append to it.
 
-        Without `resume`, an existing journal with messages is renamed first (`set_aside`). With `resume`, the bytes behind
+        Without `resume`, an existing journal with messages is renamed first (`set_aside`). With `resume`, the bytes after
         the last undamaged record are removed. segment: the size at which a segment is sealed and compressed, bytes.
-        min_free: the free space at which the journal stops, bytes. On a small disk it is less (`_SMALL`). warn: the function
-        that is called with each warning, from any thread.
-        Raises OutputError if another session writes the journal, the file is not a journal, or it cannot be opened.
+        min_free: the free space of the disk at which the journal stops, bytes. The limit is smaller on a small disk
+        (`_SMALL`). warn: the function that is called with each warning, from any thread. Raises OutputError if another
+        session writes the journal, if the file is not a journal, or if the file cannot be opened.
         """
         self.file, self._segment, self._warn = file, segment, warn
         self._min_free = min_free
@@ -99,7 +103,7 @@ class Journal:
                 self._append(pack_record(self._header.version, content))
 
     def close(self) -> None:
-        """Sync the journal to the disk and close it. Raises OutputError if it cannot be synced."""
+        """Sync the journal to the disk and close it. Raises OutputError if the sync fails."""
         if self._stream < 0:
             return
         self._closed.set()
@@ -113,9 +117,9 @@ class Journal:
             os.close(stream)
 
     def _sync(self) -> None:
-        """Until the journal is closed, sync it every `_SYNC_EVERY`, watch the disk, and seal and compress full segments.
+        """Sync the journal every `_SYNC_EVERY` until it is closed, watch the disk, and seal and compress full segments.
 
-        A thread runs this, so no message waits for the disk.
+        This method runs in its own thread, so no message waits for the disk.
         """
         self._compress()
         synced = 0
@@ -176,7 +180,7 @@ class Journal:
         return True
 
     def _compress(self) -> None:
-        """Compress the earlier segments that are uncompressed. One that cannot be compressed can still be read."""
+        """Compress the earlier segments that are uncompressed. Warn if this fails, because they can still be read."""
         try:
             for full in uncompressed_segments(self.file, identity_of(self.file, self._header), self._header.number):
                 compress(full)
@@ -194,7 +198,7 @@ class Journal:
         self._end += len(data)
 
     def _stop(self, reason: str) -> None:
-        """Stop writing, and warn why. If possible, remove an incomplete record, and write the reason into the journal."""
+        """Stop writing, and warn with the reason. If possible, remove an incomplete record and write the reason there."""
         if self.stopped is not None:
             return
         self.stopped = reason
@@ -207,7 +211,7 @@ class Journal:
 
 
 def _locked(file: Path) -> int:
-    """Open and lock a journal, and return its descriptor. Without a journal, an empty file is made.
+    """Open and lock a journal, and return its file descriptor. If there is no journal, make an empty file.
 
     Raises OutputError if another session writes the journal.
     """
@@ -221,13 +225,13 @@ def _locked(file: Path) -> int:
         except (OSError, OutputError):
             os.close(stream)
             raise
-        os.close(stream)  # The next segment replaced this file before the lock.
+        os.close(stream)  # A new segment replaced this file before it was locked.
 
 
 def _existing(file: Path) -> tuple[Header | None, int, int]:
-    """Return the header of a journal, the end of its last undamaged record, and its size, both in bytes.
+    """Return the header of a journal, the end of its last undamaged record, bytes, and the size of the file, bytes.
 
-    If the file is cut off in its header, the header is None and the end is 0. Raises OutputError if it is not a journal.
+    If the file is cut off in its header, the header is None and the end is 0. Raises OutputError if the file is no journal.
     """
     size = file.stat().st_size
     with file.open("rb") as stream:

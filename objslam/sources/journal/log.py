@@ -1,4 +1,4 @@
-"""A journal read as a log."""
+"""Read a journal as a log."""
 
 from pathlib import Path
 
@@ -15,7 +15,10 @@ from objslam.sources.journal.segments import journal_file
 
 
 def read_journal(path: Path, ledger: Ledger) -> Log:
-    """Read a journal as a log, with the stamps that the session gave the messages. Raises LogError if it has no frames."""
+    """Return the log of a journal, with the stamps that the session gave to the messages.
+
+    Raises LogError if the path is not a journal, or if the journal has no frames.
+    """
     poses: dict[str, list[PoseMessage]] = {"odometry": [], "localization": []}
     cameras: dict[str, Camera] = {}
     frames: dict[str, list[FrameMessage]] = {}

@@ -24,10 +24,11 @@ from objslam.sources.journal.segments import Segment, compress, identity_of, jou
 
 @dataclass(frozen=True)
 class Check:
-    """The content of a segment. format: 1 or 2, 0 without a readable header. size: of the file, bytes, 0 if it is missing.
+    """The state of a segment. format: 1 or 2, or 0 if the header cannot be read. size: bytes, 0 if the file is missing.
 
-    records: the number of undamaged records. unknown: how many of them this version of objslam cannot read. damaged: the
-    bytes that belong to no undamaged record. start, end: the least and the greatest stamp, s, None without stamps.
+    records: the number of undamaged records. unknown: the number of undamaged records that this version of objslam cannot
+    read. damaged: the number of bytes that belong to no undamaged record. start, end: the least and the greatest stamp, s,
+    None if no record has a stamp.
     """
 
     path: Path
@@ -45,7 +46,7 @@ class Check:
 
 
 def verify(path: Path) -> list[Check]:
-    """Check each segment of a journal, also a missing one. Raises LogError if the path is not a journal."""
+    """Return the state of each segment of a journal, including missing ones. Raises LogError if the path is no journal."""
     return [_check(segment) for segment in segments(path)]
 
 
@@ -53,8 +54,8 @@ def repair(path: Path) -> list[Path]:
     """Rewrite each damaged segment without its damage, and compress the earlier segments that are uncompressed.
 
     Return the files that were written. The damaged file is kept beside the new one, with ".damaged" after its name. Records
-    that this version of objslam cannot read are kept. A missing segment, or one without a header, cannot be repaired. Raises
-    LogError if the path is not a journal, and OutputError if a session writes it or a file cannot be written.
+    that this version of objslam cannot read are kept. A segment that is missing or has no header cannot be repaired. Raises
+    LogError if the path is not a journal, and OutputError if a session writes the journal or a file cannot be written.
     """
     file = journal_file(path)
     found = segments(path)
@@ -64,14 +65,14 @@ def repair(path: Path) -> list[Path]:
         last = found[-1].header
         assert last is not None
         made += [compress(full) for full in uncompressed_segments(file, identity_of(file, last), last.number)]
-    return [one for one in made if one.exists()]  # If a rewritten segment was then compressed, it has another name.
+    return [one for one in made if one.exists()]  # A rewritten segment that was then compressed has another name.
 
 
 def json_lines(path: Path, ledger: Ledger, left_out: Counter[str]) -> Iterator[str]:
     """Yield the messages of a journal as lines for `objslam live stdin`, with the stamps of the session.
 
-    left_out: counts the messages that have no such line, by kind: "note" (`NoteMessage`) or "calibration". Raises LogError
-    if the path is not a journal.
+    left_out: gets the number of messages that have no such line, by kind. The kinds are "note" (`NoteMessage`), and
+    "calibration", "bodies", "association" and "names" (corrections). Raises LogError if the path is not a journal.
     """
     for message in messages(path, ledger):
         row = _row(message)

@@ -12,10 +12,10 @@ from objslam.sources.journal.segments import contents
 
 
 def messages(path: Path, ledger: Ledger) -> Iterator[Message]:
-    """Read the messages of a journal in order. Raises LogError if it is not a journal.
+    """Yield the messages of a journal in order. Raises LogError if the path is not a journal.
 
-    Damaged records and segments, and records of other versions of objslam, are dropped and counted. If a session had to stop
-    the journal before its own end, the ledger gets a warning.
+    Damaged records and segments, and records of other versions of objslam, are dropped and counted. If the journal stopped
+    before the end of its session, the ledger gets a warning.
     """
     for place, content in contents(path, ledger):
         try:
@@ -28,8 +28,8 @@ def messages(path: Path, ledger: Ledger) -> Iterator[Message]:
 
 
 def corrections(file: Path) -> list[Correction]:
-    """Return only the corrections in the journal `file`. A correction may come later in the file than the keyframe at which
-    it takes effect."""
+    """Return the corrections in the journal `file`. A correction may be later in the file than the keyframe from which
+    the correction is valid."""
     found: list[Correction] = []
     for _, content in contents(file, Ledger()):
         if content[:1] in CORRECTION_READERS:

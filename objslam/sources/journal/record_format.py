@@ -1,10 +1,10 @@
-"""The bytes of a journal file: a header, then records, each with a checksum of its own.
+"""The format of a journal file. The file is a header and records. Each record has its own checksum.
 
 New journals have format 2. Its header has four parts: `OBJSLAM2`, 8 bytes that identify the journal, the number of this
 segment from 1 on, and a CRC-32 of these three parts. A record is a mark, the length of its content, a CRC-32 of length and
-content, and the content. The mark lets a reader find the next record behind a damaged one. Format 1 is only read, and
-appended to. Its header is `OBJSLAM1`. Its records have no mark, and their CRC-32 covers the content alone. All numbers are
-little endian and have 4 bytes.
+content, and the content. By the mark, a reader finds the next record after a damaged one. Existing files in format 1 are
+read, and records are appended to them. Their header is `OBJSLAM1`. Their records have no mark, and the CRC-32 covers only
+the content. All numbers are little endian and have 4 bytes.
 """
 
 import struct
@@ -14,23 +14,23 @@ from dataclasses import dataclass
 from typing import BinaryIO
 
 NAME = "journal.objslam"
-"""The usual name of a journal."""
+"""The usual file name of a journal."""
 MAGICS = {1: b"OBJSLAM1", 2: b"OBJSLAM2"}
 """The first bytes of a journal file, by format."""
 LONGEST = 1 << 26
-"""The largest content of a record, bytes. A record that states a greater length counts as damaged."""
+"""The largest length of the content of a record, bytes. A record that states a greater length counts as damaged."""
 _HEADER = struct.Struct("<8s8sII")
 _MARK = b"\xf5REC"
 _HEADS = {1: struct.Struct("<II"), 2: struct.Struct("<4sII")}
-_CHUNK = 1 << 18  # The bytes of one read. A larger number makes fewer reads.
-_MOST_WASTED = 1 << 30  # The most bytes of damaged records that are checked. A larger number takes longer on a damaged file.
+_CHUNK = 1 << 18  # The number of bytes of one read. A larger number makes fewer reads.
+_MOST_WASTED = 1 << 30  # The most bytes of damaged records that are checked. With more, a damaged file takes longer.
 
 
 @dataclass(frozen=True)
 class Header:
-    """The header of a journal file. version: the format, 1 or 2. size: of the header, bytes.
+    """The header of a journal file. version: the format, 1 or 2. size: the length of the header, bytes.
 
-    identity: 8 bytes, the same in all segments of a journal. number: the number of the segment, from 1 on.
+    identity: 8 bytes that are the same in all segments of a journal. number: the number of the segment, from 1 on.
     """
 
     version: int
@@ -41,7 +41,7 @@ class Header:
 
 @dataclass(frozen=True)
 class Record:
-    """A record. start, end: its first byte in the uncompressed file, and the byte behind it."""
+    """A record. start: the place of its first byte in the uncompressed file. end: the place after its last byte."""
 
     start: int
     end: int
@@ -49,7 +49,7 @@ class Record:
 
 
 def pack_header(identity: bytes, number: int) -> bytes:
-    """Return the header of the segment `number` of a journal in format 2. identity: 8 bytes."""
+    """Return the bytes of the header of segment `number` in format 2. identity: the 8 bytes that identify the journal."""
     first = _HEADER.pack(MAGICS[2], identity, number, 0)[:-4]
     return first + zlib.crc32(first).to_bytes(4, "little")
 
@@ -62,7 +62,7 @@ def pack_record(version: int, content: bytes) -> bytes:
 
 
 def read_header(stream: BinaryIO) -> Header | None:
-    """Read the header. Return None if the file is no journal or its header is damaged or incomplete."""
+    """Return the header of a journal file. Return None if the file is no journal, or its header is damaged or incomplete."""
     magic = stream.read(len(MAGICS[1]))
     if magic == MAGICS[1]:
         return Header(1, len(magic))
@@ -74,15 +74,15 @@ def read_header(stream: BinaryIO) -> Header | None:
 
 
 def is_cut_header(data: bytes) -> bool:
-    """Return whether `data`, the whole content of a file, is the beginning of a header, or is empty."""
+    """Return whether `data` is an incomplete header or empty. data: the whole content of a file, or its first 64 bytes."""
     return len(data) < _HEADER.size and any((data + magic[len(data) :]).startswith(magic) for magic in MAGICS.values())
 
 
 def records(stream: BinaryIO, header: Header) -> Iterator[Record]:
-    """Yield the undamaged records that follow the header. The stream is at the byte behind the header.
+    """Yield the undamaged records after the header. stream: the file, at the first byte after the header.
 
-    If the `start` of a record is not the `end` of the record before, the bytes between are damaged. In format 1, no record
-    behind a damaged one can be found. The stream need not be seekable.
+    If the `start` of a record is not the `end` of the previous record, the bytes between are damaged. In format 1, the
+    records after a damaged one cannot be found. The stream may be one that cannot seek.
     """
     head, buffer, base, at, wasted = _HEADS[header.version], bytearray(), header.size, 0, 0
 

@@ -18,13 +18,13 @@ from objslam.sources.journal.fields import as_array, as_count, as_name, as_pose,
 
 PathKind = Literal["odometry", "localization"]
 
-_POSE = struct.Struct("<c13d")  # The bytes of a pose message: its kind, its stamp and the upper three rows of the matrix.
+_POSE = struct.Struct("<c13d")  # The bytes of a pose message: the kind, the stamp and the upper three rows of the matrix.
 _MOUNT = struct.Struct("<cd12dH")  # The bytes of a mount message: the bytes of a pose message, then the name's length.
 _KINDS: dict[PathKind, bytes] = {"odometry": b"O", "localization": b"L"}
 _PATHS: dict[bytes, PathKind] = {kind: path for path, kind in _KINDS.items()}
 _MOUNT_KIND, _CAMERA_KIND, _FRAME_KIND, _NOTE_KIND = b"M", b"C", b"F", b"N"
 _STOP_KIND = b"E"
-_LONGEST_REASON = 200  # The most letters of a reason that are shown. A larger number shows more of it.
+_LONGEST_REASON = 200  # The largest number of letters of a reason that are shown. A larger number shows more letters.
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class PoseMessage:
 
 @dataclass(frozen=True)
 class MountMessage:
-    """The pose base_T_camera (4, 4) of a moving camera on the robot. It is valid from its stamp (s) until the next mount."""
+    """The pose base_T_camera (4, 4) of a moving camera, valid from `stamp` (s) until the next mount. camera: its name."""
 
     stamp: float
     camera: str
@@ -49,13 +49,13 @@ class HeldMounts:
     """The mounts of one camera, which are its poses on the robot. Each mount is valid until the next one."""
 
     def __init__(self, most: int | None = None) -> None:
-        """Start without mounts. most: how many of the newest mounts are kept. None keeps all."""
+        """Start without mounts. most: the largest number of mounts that are kept, the newest ones. None keeps all."""
         self._most = most
         self._stamps: list[float] = []
         self._poses: list[Floats] = []
 
     def add(self, message: MountMessage) -> None:
-        """Add a mount. It replaces a mount that was added before with the same stamp."""
+        """Add a mount. The new mount replaces an earlier one with the same stamp."""
         at = bisect_right(self._stamps, message.stamp)
         self._stamps.insert(at, message.stamp)
         self._poses.insert(at, message.pose)
@@ -63,7 +63,7 @@ class HeldMounts:
             del self._stamps[0], self._poses[0]
 
     def at(self, stamp: float, camera: Camera) -> Floats:
-        """Return base_T_camera (4, 4) at a stamp (s). Before the first mount, it is the one in `camera`."""
+        """Return base_T_camera (4, 4) at a stamp (s). Before the first mount, this is `camera.base_T_camera`."""
         at = bisect_right(self._stamps, stamp)
         return self._poses[at - 1] if at else camera.base_T_camera
 
@@ -77,7 +77,10 @@ class CameraMessage:
 
 @dataclass(frozen=True)
 class FrameMessage:
-    """The B boxes of one image. The fields boxes (B, 4), scores, depths, track_ids (B,) and whole are as in `Detections`."""
+    """The B boxes of one image of the camera named `camera`. stamp: s. The other fields are as in `Detections`.
+
+    boxes has shape (B, 4). labels, scores, depths and track_ids have B elements.
+    """
 
     stamp: float
     camera: str
@@ -96,7 +99,8 @@ class FrameMessage:
 class NoteMessage:
     """The offsets that a session adds to later stamps and odometry, after the robot's clock or odometry jumped.
 
-    clock: s, added to stamps. odometry: start_T_odom (4, 4), the present odom frame in the first odom frame of the session.
+    clock: the offset that is added to stamps, s. odometry: start_T_odom (4, 4), the pose of the present odom frame in the
+    first odom frame of the session.
     """
 
     clock: float
@@ -107,17 +111,17 @@ Message = PoseMessage | MountMessage | CameraMessage | FrameMessage | NoteMessag
 
 
 def encode_stop(reason: str) -> bytes:
-    """Encode the record that says why a session had to stop the journal."""
+    """Return the bytes of the record with the reason why a session stopped the journal."""
     return _STOP_KIND + json.dumps([reason]).encode()
 
 
 def is_stop(data: bytes) -> bool:
-    """Return whether a record says that a session had to stop the journal."""
+    """Return whether a record contains the reason why a session stopped the journal."""
     return data.startswith(_STOP_KIND)
 
 
 def read_stop(data: bytes) -> str:
-    """Return why a session had to stop the journal. Raises LogError if the bytes give no reason."""
+    """Return the reason why a session stopped the journal. Raises LogError if the bytes cannot be read."""
     try:
         (reason,) = json.loads(data[1:])
     except (ValueError, TypeError, RecursionError) as error:
@@ -126,7 +130,7 @@ def read_stop(data: bytes) -> str:
 
 
 def encode(message: Message) -> bytes:
-    """Encode a message. `decode` returns the same message, bit for bit."""
+    """Return a message as bytes. `decode` returns the same message, bit for bit."""
     if isinstance(message, PoseMessage):
         return _POSE.pack(_KINDS[message.path], message.stamp, *message.pose[:3].ravel().tolist())
     if isinstance(message, MountMessage):
@@ -149,7 +153,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes) -> Message:
-    """Decode a message. Raises LogError if the bytes are no message, or contain a value that no session accepts."""
+    """Return the message in the bytes. Raises LogError if the bytes are no message, or contain an invalid value."""
     try:
         reader = _READERS.get(data[:1])
         if reader is None:

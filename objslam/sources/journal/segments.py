@@ -1,8 +1,8 @@
-"""The segments of a journal. A long journal is cut into files, and all but the last are compressed with zstd.
+"""The segments of a journal. A long journal is split into several files, and all but the last are compressed with zstd.
 
-The last segment has the name of the journal. The earlier segments are beside it as journal-IDENTITY.NUMBER.objslam.zst.
-IDENTITY is in the header of the last segment. So a journal that is renamed keeps its earlier segments, whose names do not
-change.
+The last segment has the name of the journal. The earlier segments are in the same folder, with the names
+journal-IDENTITY.NUMBER.objslam.zst. IDENTITY is in the header of the last segment. A renamed journal therefore keeps its
+earlier segments, whose names do not change.
 """
 
 import fcntl
@@ -26,13 +26,13 @@ from objslam.sources.journal.record_format import NAME, Header, pack_header, rea
 
 _PACKED = ".zst"
 _LEVEL = 3  # The zstd level. A larger level makes smaller files and takes more time.
-_WINDOW = 1 << 27  # The most memory, bytes, to unpack a segment. A larger value lets a damaged file take more memory.
-_CHUNK = 1 << 20  # The bytes of one read. A larger number makes fewer reads.
+_WINDOW = 1 << 27  # The largest memory to unpack a segment, bytes. With a larger value, a damaged file can take more memory.
+_CHUNK = 1 << 20  # The number of bytes of one read. A larger number makes fewer reads.
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A file of a journal. number: the first file has 1. header: None if it is damaged or the file is missing."""
+    """A file of a journal. number: 1 for the first file. header: None if the header is damaged or the file is missing."""
 
     path: Path
     number: int
@@ -40,14 +40,14 @@ class Segment:
 
     @contextmanager
     def open(self) -> Iterator[BinaryIO]:
-        """Open the file, uncompressed, at the byte behind its header, as `records` needs it."""
+        """Yield a stream of the uncompressed file, at the first byte after the header, as `records` needs it."""
         with _uncompressed(self.path) as stream:
             read_header(stream)
             yield stream
 
 
 def journal_file(path: Path) -> Path:
-    """Return the journal at a path, which is the file itself or its folder."""
+    """Return the file of a journal. path: this file, or the folder that contains it."""
     return path / NAME if path.is_dir() else path
 
 
@@ -61,13 +61,12 @@ def is_journal(path: Path) -> bool:
 
 
 def holds_messages(file: Path, header: Header | None) -> bool:
-    """Return whether a journal has messages. header: the header of its last segment, which is `file`, None if the header is
-    damaged."""
+    """Return whether a journal has messages. file: its last segment. header: the header of `file`, None if it is damaged."""
     return header is not None and (header.number > 1 or file.stat().st_size > header.size)
 
 
 def segments(path: Path) -> list[Segment]:
-    """Return the segments of a journal in order, also missing ones. Raises LogError if the path is not a journal."""
+    """Return the segments of a journal in order, including missing ones. Raises LogError if the path is not a journal."""
     file = journal_file(path)
     last = _header(file) if file.is_file() else None
     if last is None:
@@ -103,7 +102,7 @@ def contents(path: Path, ledger: Ledger) -> Iterator[tuple[str, bytes]]:
 
 
 def sealed(file: Path, identity: bytes, number: int) -> Path:
-    """Return the path of a finished segment that is not compressed yet."""
+    """Return the path of segment `number` after it is sealed and before it is compressed. file: the last segment."""
     return file.with_name(f"journal-{identity.hex()}.{number:06d}.objslam")
 
 
@@ -116,13 +115,13 @@ def identity_of(file: Path, header: Header) -> bytes:
 
 
 def seal(file: Path, identity: bytes, number: int, fresh: Path) -> Path:
-    """Rename the full segment `file` as an earlier segment, put the new file `fresh` in its place, and return the new name.
+    """Give the full segment `file` the name of an earlier segment, then rename `fresh` to `file`. Return the new name.
 
-    A process that is killed between the two steps leaves the full segment under both names. Nothing is lost then, and the
-    next call does both steps. Raises OSError.
+    A process that is killed between the two steps leaves the full segment under both names. In this case nothing is lost,
+    and the next call does both steps. Raises OSError if a file cannot be renamed.
     """
     full = sealed(file, identity, number)
-    full.unlink(missing_ok=True)  # A killed process may have left it. All of it is in `file`.
+    full.unlink(missing_ok=True)  # A killed process may have left this file. All its content is in `file`.
     try:
         full.hardlink_to(file)
     except OSError:  # The file system has no links.
@@ -132,7 +131,10 @@ def seal(file: Path, identity: bytes, number: int, fresh: Path) -> Path:
 
 
 def new_file(file: Path, identity: bytes, number: int) -> tuple[Path, int]:
-    """Make the file of a segment under a temporary name beside the journal. Return its path and its locked descriptor."""
+    """Make the file of segment `number` under a temporary name beside the journal `file`.
+
+    Return the path of the new file and its locked file descriptor. Raises OSError if the file cannot be written.
+    """
     fresh = file.with_name(temporary_name(file))
     handle = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
     try:
@@ -147,9 +149,9 @@ def new_file(file: Path, identity: bytes, number: int) -> tuple[Path, int]:
 
 
 def compress(full: Path) -> Path:
-    """Compress the file of a segment, read it back, and delete the uncompressed file. Return the compressed one.
+    """Compress the file of a segment, and delete the uncompressed file. Return the path of the compressed file.
 
-    Raises OSError, also if the compressed file does not read back as it was.
+    Raises OSError for a disk error, or if the compressed file does not have the same content.
     """
     packed = full.with_name(full.name + _PACKED)
     temporary = packed.with_name(temporary_name(packed))
@@ -170,7 +172,7 @@ def compress(full: Path) -> Path:
 
 
 def uncompressed_segments(file: Path, identity: bytes, number: int) -> list[Path]:
-    """Return the segments before `number` that are not compressed, because they are new or a session was killed."""
+    """Return the uncompressed files of the segments before `number`. They are new, or left by a session that was killed."""
     return [full for n in range(1, number) if (full := sealed(file, identity, n)).exists()]
 
 
@@ -195,7 +197,7 @@ def _uncompressed(path: Path, packed: bool = False) -> Iterator[BinaryIO]:
 
 
 class _Unpacked(io.RawIOBase):
-    """The uncompressed bytes of a zstd stream, up to its first damage."""
+    """A stream of the uncompressed bytes of a zstd stream, up to its first damaged part."""
 
     def __init__(self, stream: BinaryIO) -> None:
         reader = zstandard.ZstdDecompressor(max_window_size=_WINDOW)

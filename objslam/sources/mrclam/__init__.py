@@ -1,4 +1,4 @@
-"""The options of UTIAS MRCLAM datasets. The folders are read in `reader`, which `--help` does not import."""
+"""The options of UTIAS MRCLAM datasets. The module `reader` reads the folders. `--help` does not import `reader`."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -8,7 +8,7 @@ from objslam.sources.options import Option, WithRange
 
 @dataclass(frozen=True)
 class MrclamOptions:
-    """Choices that the folder leaves open: the robot, the use of ranges, and whether all landmarks share one label."""
+    """The options of an MRCLAM dataset: the robot, the use of ranges, and whether all landmarks have the same label."""
 
     robot: Annotated[int | None, Option("--robot", "MRCLAM: the number of the robot.")] = None
     with_range: WithRange = True

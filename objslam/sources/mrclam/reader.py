@@ -1,7 +1,7 @@
-"""Read UTIAS MRCLAM datasets: wheel odometry, and ranges and bearings that a camera measured to landmarks with barcodes.
+"""Read UTIAS MRCLAM datasets. They have wheel odometry, and ranges and bearings from a camera to landmarks with barcodes.
 
 Source: Leung, Halpern, Barfoot, Liu, The UTIAS multi-robot cooperative localization and mapping dataset, IJRR 30(8), 2011.
-The reader converts bearings into pixels of a virtual pinhole camera. It is in the origin of base and looks forward.
+The reader converts bearings into pixels of a virtual pinhole camera. This camera is at the origin of base and looks forward.
 """
 
 import re
@@ -23,15 +23,16 @@ from objslam.sources.mrclam import MrclamOptions
 ROBOTS, LANDMARKS = range(1, 6), range(6, 21)
 """The subject numbers of robots and of landmarks in the dataset."""
 _FOCAL = 380.0
-"""The focal length of the virtual camera, px. With it, the bearings' noise of 0.45 degrees is the default noise of 3 px."""
+"""The focal length of the virtual camera, px. With this value, the noise of the bearings, 0.45 degrees, is 3 px. This is the
+default noise of a run."""
 _WIDTH, _HEIGHT = 640, 480
-"""The image size of the virtual camera, px. It sees +-40 degrees, more than the +-30 degrees of the real camera."""
+"""The image size of the virtual camera, px. The virtual camera sees +-40 degrees. The real camera sees +-30 degrees."""
 _MATRIX = np.array([[_FOCAL, 0, _WIDTH / 2], [0, _FOCAL, _HEIGHT / 2], [0, 0, 1.0]])
 _FORWARD = make_pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
-"""base_T_camera of the virtual camera. The camera is in the origin of base and looks along base x."""
-_FASTEST = 1000.0  # The speed, m/s and rad/s, from which an odometry line is dropped. A larger value lets damaged lines in.
-_HALF_BOX = 4.0  # Half the side of a box, px. The dataset has bearings but no boxes, so a small box is made.
-_MARGIN = 6.0  # The least distance of a box centre from the image's edge, px. Boxes nearer to it would count as cut off.
+"""base_T_camera of the virtual camera. The camera is at the origin of base and looks along base x."""
+_FASTEST = 1000.0  # The speed, m/s and rad/s, from which an odometry line is dropped. A larger value keeps damaged lines.
+_HALF_BOX = 4.0  # Half the side of a box, px. The dataset has bearings but no boxes, so each bearing gets a small box.
+_MARGIN = 6.0  # The least distance of a box centre from the image's edge, px. Boxes nearer to the edge count as cut off.
 
 
 def is_mrclam(path: Path) -> bool:
@@ -46,11 +47,11 @@ def robots(folder: Path) -> tuple[int, ...]:
 
 
 def read_mrclam(folder: Path, ledger: Ledger, options: MrclamOptions) -> Log:
-    """Read one robot of an MRCLAM folder (files .dat or .dat.gz).
+    """Return the log of one robot in an MRCLAM folder (files .dat or .dat.gz).
 
-    Odometry starts at the identity and integrates the velocities. Each stamp with a measurement becomes a frame, even if all
-    its measurements are dropped. Depths are the ranges (see `_read_measurements`), or NaN without `options.with_range`.
-    Labels are landmark_<subject>, or all "landmark" with `options.anonymous`.
+    The odometry starts at the identity and integrates the velocities. Each stamp with a measurement becomes a frame, even if
+    all measurements of this stamp are dropped. Depths are the ranges (see `_read_measurements`), or NaN without
+    `options.with_range`. Labels are landmark_<subject>. With `options.anonymous`, all labels are "landmark".
     The ground truth has the landmark positions (z = 0) and the robot's path.
     Measurements of other robots, of unknown barcodes, and outside the virtual camera's view are dropped and counted.
     Raises LogError if a file is unusable, no robot is chosen, or the folder lacks the robot.
@@ -82,10 +83,10 @@ def read_mrclam(folder: Path, ledger: Ledger, options: MrclamOptions) -> Log:
 
 
 def integrate(stamps: Floats, velocities: Floats) -> Floats:
-    """Integrate the velocities of a robot. Returns x, y (m) and yaw (rad) at each stamp, (N, 3), with zero at the first.
+    """Return x, y (m) and yaw (rad) of a robot at each stamp, (N, 3), from its velocities. The first pose is zero.
 
-    stamps: (N,) s. velocities: (N, 2) forward (m/s) and turn (rad/s). Each is valid until the next stamp, so that the robot
-    drives exact arcs.
+    stamps: (N,) s. velocities: (N, 2) forward velocity (m/s) and turn rate (rad/s). Each row is valid until the next stamp,
+    so the robot drives exact arcs.
     """
     way, turn = (velocities[:-1] * np.diff(stamps)[:, None]).T
     half = turn / 2
@@ -120,17 +121,17 @@ def _read_forward(folder: Path, name: str, columns: int, ledger: Ledger, what: s
 
 
 def _trajectory(stamps: Floats, xy_yaw: Floats) -> Trajectory:
-    first = np.concatenate([[True], np.diff(stamps) > 0])  # A Trajectory takes one pose for each stamp.
+    first = np.concatenate([[True], np.diff(stamps) > 0])  # Stamps may repeat. A Trajectory has one pose for each stamp.
     return Trajectory(stamps[first], lift_se2(xy_yaw[first]))
 
 
 def _read_measurements(folder: Path, prefix: str, options: MrclamOptions, ledger: Ledger) -> Detections:
-    """Read the measurements. What the dataset calls a range is a depth along the optical axis.
+    """Return the measurements as detections. The "range" of the dataset is used as a depth along the optical axis.
 
-    The camera measures how high a barcode is in its image, and the height of a thing in an image shows its depth. At the
-    poses of the motion capture, the ranges of five robots of MRCLAM 6 and 7 fall behind the distances of the landmarks as
-    the cosine of the bearing does: by 11 % at 27 degrees. They scatter by 3.4 to 4.5 % as distances, and by 0.8 to 1.6 %
-    as depths.
+    The camera measures the height of a barcode in its image, and this height depends on the depth. This was tested with the
+    poses of the motion capture and five robots of MRCLAM 6 and 7. The ranges are shorter than the distances of the landmarks
+    by the cosine of the bearing, which is 11 % at 27 degrees. Their errors scatter by 3.4 to 4.5 % if they are taken as
+    distances, and by 0.8 to 1.6 % if they are taken as depths.
     """
     _, barcodes = _read(folder, "Barcodes", 2, ledger, "barcode")
     path, table = _read_forward(folder, f"{prefix}_Measurement", 4, ledger, "measurement")

@@ -19,10 +19,10 @@ from objslam.sources.ros_bag.trajectories import tf_path
 
 @dataclass(frozen=True)
 class CameraTopics:
-    """The topics of one camera, each None if there is none. frame: the name of its optical coordinate frame.
+    """The topics of one camera. A topic is None if the camera does not have it.
 
-    info: the topic of its CameraInfo. calibration: the calibration from a file, None without a file. rectified: whether
-    boxes and images are rectified.
+    frame: the name of the optical frame of the camera. info: the topic of its CameraInfo. calibration: the calibration from
+    a file, None without a file. rectified: whether boxes and images are rectified.
     """
 
     name: str
@@ -38,20 +38,20 @@ class CameraTopics:
 def find_cameras(
     pool: TopicPool, tree: TfTree, calibrations: Sequence[Calibration], rectified: bool | None
 ) -> tuple[CameraTopics, ...]:
-    """Find the cameras of a recording and their topics.
+    """Return the cameras of a recording with their topics.
 
-    The recording decides what counts as a camera:
+    The calibrations and the topics determine the cameras:
 
-    - With calibrations from a file, each calibration is a camera. Its topics have the camera's name as a part of their name
-      or frame_id. A single calibration without such topics takes all topics. One of several calibrations without such topics
-      is left out with a warning.
+    - With calibrations from a file, each calibration is a camera. The topics of this camera have its name as a part of their
+      name or frame_id. If there is a single calibration and no such topic, the camera gets all topics. If there are several
+      calibrations, one without such topics is left out with a warning.
     - Otherwise, each frame_id of detections is a camera.
     - Without detections, each frame_id that colour images share with a CameraInfo is a camera. A single topic of colour
-      images is a camera too.
-    - Without detections and images, each frame_id of a CameraInfo is a camera, and each calibration.
+      images is always a camera.
+    - Without detections and images, each frame_id of a CameraInfo is a camera, and each calibration is one.
 
     The other topics of a camera have its frame_id. If several topics fit a role, the topic with the most similar name is
-    taken with a warning. rectified: whether boxes and images are rectified. None lets the topic names decide.
+    taken with a warning. rectified: whether boxes and images are rectified. With None, the topic names determine this.
     """
     detections, images = pool.fitting("detections"), pool.fitting("image")
     seeds = detections or images or pool.fitting("camera_info")
@@ -86,10 +86,10 @@ def find_cameras(
 def build_camera(
     topics: CameraTopics, tree: TfTree, base: str, ledger: Ledger, mounts: Sequence[Mount] = ()
 ) -> tuple[Camera, Trajectory | None]:
-    """Build a camera from its topics. Returns the camera, and base_T_camera over time, which is None if it never changes.
+    """Return the camera of `topics`, and base_T_camera over time, which is None if base_T_camera never changes.
 
-    base: the name of the base frame. mounts: base_T_camera of cameras with a CameraInfo, from a file. They replace the poses
-    from tf.
+    base: the name of the base frame. mounts: base_T_camera of cameras with a CameraInfo, from a file. These poses replace
+    the poses from tf.
     Raises LogError if the calibration is missing or tf does not connect base with the camera.
     """
     given = topics.calibration
@@ -132,11 +132,11 @@ def _gather(
     rectified: bool | None,
     alone: bool,
 ) -> CameraTopics:
-    """Find all topics of a camera. seeds: the topics of detections or images that define the camera.
+    """Return a camera with all its topics. seeds: the topics of detections, images or CameraInfo that define the camera.
 
-    Its other images have the frame_id `frame`. The only camera (`alone`) also gets images with another frame_id, if the user
-    chose these images or if the camera has no frame_id. Its CameraInfo has the same frame_id. Without such a CameraInfo, one
-    with a similar name is taken, or any if no name is similar.
+    The other images of the camera have the frame_id `frame`. alone: whether this is the only camera. The only camera also
+    gets images with another frame_id, if the user chose these images or if the camera has no frame_id. The CameraInfo has
+    the frame_id `frame`. Without such a CameraInfo, one with a similar name is taken, or any one if no name is similar.
     """
 
     def mine(role: str) -> list[Topic]:

@@ -20,9 +20,10 @@ from objslam.sources.summary import FIND_BOXES, Timing, off_path, timing
 class TopicInfo:
     """One topic of a bag.
 
-    messages: the number of messages. timing: the timing of the messages by their header stamps, or by the times of recording
-    for tf and for types that objslam does not use. role: the role in a run, "" for none. frame: the most frequent frame_id.
-    detail: a short description of the messages. refused: the reasons why messages are unusable, with counts.
+    messages: the number of messages. timing: the timing of the messages by their header stamps. For tf and for types that
+    objslam does not use, the times of recording are taken. role: the role in a run, "" without a role. frame: the most
+    frequent frame_id. detail: a short description of the messages. refused: the reasons why messages are unusable, each
+    with the number of messages.
     """
 
     name: str
@@ -40,10 +41,10 @@ class BagInfo:
     """The summary of a bag.
 
     start, end: the times at which the first and the last message were recorded, s, 0 without messages. messages: the number
-    of messages that were read. lost: the number of messages that damage made unreadable. base: the base frame. odometry,
-    localization: the topic or transform that gives this path, "" for none. places: the optical frames that tf connects to
-    base. missing: one line for each thing that a run needs but the bag lacks. damage: one line for each kind of damage in
-    each file. warnings: the warnings that a run would give.
+    of messages that were read. lost: the number of messages that cannot be read because of damage. base: the base frame.
+    odometry, localization: the topic or transform that gives this path, "" without this path. places: the optical frames
+    that tf connects to base. missing: one line for each thing that a run needs but the bag lacks. damage: one line for each
+    kind of damage in each file. warnings: the warnings that a run would give.
     """
 
     name: str
@@ -65,7 +66,10 @@ class BagInfo:
 
 
 def describe(paths: Path | Sequence[Path], options: BagOptions | None = None) -> BagInfo:
-    """Summarise a bag. paths: as in `read_bag`. Raises LogError if no file can be read, and ConfigError for bad options."""
+    """Return the summary of a bag. paths: as in `read_bag`.
+
+    Raises LogError if no file can be read, and ConfigError for options that do not fit the bag.
+    """
     options = options or BagOptions()
     ledger = Ledger()
     assembly = assemble(paths, ledger, options)

@@ -43,19 +43,19 @@ _KEPT: list[tempfile.TemporaryDirectory[str]] = []
 
 _NO_INFO = "record CameraInfo too, or give --camera-info FILE"  # The advice for images without a CameraInfo.
 _BOX_WORDS = ("detection", "boundingbox", "bounding_box")
-"""Parts of the names of types that have boxes. More words name more topics where boxes may be."""
+"""Parts of the names of message types that contain boxes. With more words, the advice names more topics."""
 _NO_BOXES = """boxes from a file: `objslam convert` makes a log of this bag, put detections.jsonl into it; or record \
 Detection2DArray, AprilTag detections, or images with CameraInfo"""  # The advice for a bag without images and boxes.
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """A recording after each topic got its role, for example the odometry or the images of a camera.
+    """A recording in which each topic has its role. A role is, for example, the odometry or the images of a camera.
 
-    tree: the tree of tf. tf_topics: the names of its topics. base: the base frame. paths: the robot's paths, None if absent.
-    cast: the topics of every camera. cameras: the topics, the camera and its mount for each usable camera. The mount is
-    base_T_camera over time, None if the camera does not move.
-    problems: the errors that make a run impossible. left_out: the errors of the unusable cameras, if others are usable.
+    tree: the tree of tf. tf_topics: the names of the topics of tf. base: the base frame. paths: the robot's paths, None if
+    there are none. cast: the topics of every camera. cameras: the topics, the camera and its mount, for each usable camera.
+    The mount is base_T_camera over time, None if the camera does not move on the robot. problems: the errors that make a run
+    impossible. left_out: the errors of the unusable cameras, if other cameras are usable.
     """
 
     survey: Survey
@@ -70,13 +70,13 @@ class Assembly:
 
 
 def read_bag(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions | None = None) -> Log:
-    """Read a ROS 1 bag, a ROS 2 bag (sqlite3 or MCAP, file or folder), or several files of one recording.
+    """Return the log of a ROS 1 bag, a ROS 2 bag (sqlite3 or MCAP, file or folder), or several files of one recording.
 
-    The first pass reads everything except the images. The second pass reads the images, unless `options.with_images` is
-    False. Stamps are from the headers, or the times of recording if the headers have none. Damaged files are read as far as
-    possible and never changed. The ledger counts the lost messages. Raises LogError if the robot's path or every camera is
-    missing, and ConfigError for options that do not fit the bag. The LogError is a NoCamera if the bag has a path, but
-    neither images nor detections.
+    The first pass reads all messages and keeps everything except the images. The second pass reads the images, unless
+    `options.with_images` is False. Stamps are from the headers. If the headers have no stamps, the times of recording are
+    taken. Damaged files are read as far as possible and never changed. The ledger counts the lost messages. Raises LogError
+    if the robot's path is missing or no camera is usable, and ConfigError for options that do not fit the bag. The LogError
+    is a NoCamera if the bag has a path, but neither images nor detections.
     """
     options = options or BagOptions()
     assembly = assemble(paths, ledger, options)
@@ -105,7 +105,7 @@ def read_bag(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions |
 
 
 def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) -> Assembly:
-    """Read a recording without its images, and give topics their roles.
+    """Return a recording without its images, with the role of each topic.
 
     Raises LogError if no file can be read, and ConfigError for options that do not fit the recording.
     """
@@ -156,7 +156,7 @@ def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) 
 
 
 def unread_boxes(survey: Survey) -> str:
-    """Return advice for topics that seem to have boxes in messages that objslam does not read, "" if there are none."""
+    """Return advice if topics probably have boxes in messages that objslam does not read. Return "" without such topics."""
     found = [
         f"{topic.name} has {topic.type}"
         for topic in survey.topics.values()
@@ -215,12 +215,13 @@ def _camera_log(
 
 
 def extract_images(recording: Recording, folders: Mapping[str, tuple[Path, bool]], ledger: Ledger) -> dict[str, Images]:
-    """Write the images of topics into files, and return the written images by topic.
+    """Write the images of topics into files. Return the written images of each topic.
 
-    folders: the target folder of each topic, and whether it has depth images. Colour images in JPEG or PNG are copied. Other
-    colour images become PNG. Depth images become 16 bit PNG with `DEPTH_SCALE` units per metre and 0 for unknown depth. The
-    name of a file is its stamp. Images that cannot be decoded, or whose stamp repeats or goes back, are dropped and counted.
-    Only one image is in memory at a time. Raises LogError if a file cannot be written.
+    folders: for each topic, the target folder and whether the topic has depth images. Colour images in JPEG or PNG are
+    copied. Other colour images become PNG. Depth images become 16 bit PNG with `DEPTH_SCALE` units per metre. Their value 0
+    is an unknown depth. The name of a file is the stamp of its image, s. Images that cannot be decoded, or whose stamp
+    repeats or goes back, are dropped and counted. Only one image is in memory at a time. Raises LogError if a file cannot be
+    written.
     """
     written: dict[str, dict[int, Path]] = {topic: {} for topic in folders}
     decoders: dict[int, tuple[Connection, Callable[[bytes], Any]]] = {}

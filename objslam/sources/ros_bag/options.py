@@ -1,4 +1,4 @@
-"""The options of ROS messages, both recorded and live, and the options of bags."""
+"""The options of ROS messages, which are recorded or live, and the options of bags."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ _BASE = "ROS bags, dds, rclpy: the name of the robot's base frame."
 
 @dataclass(frozen=True)
 class RosOptions:
-    """The options of ROS messages, both in bags and live."""
+    """The options of ROS messages in bags and in live sessions."""
 
     topics: Annotated[tuple[str, ...], Option("--topic", _TOPIC, metavar="ROLE=/NAME")] = ()
     camera_info: Annotated[Path | None, Option("--camera-info", _CALIBRATION)] = None
@@ -29,7 +29,7 @@ class RosOptions:
 class BagOptions(RosOptions):
     """The options of bags.
 
-    extract: the folder for the images. None makes a temporary folder that is removed when the program ends.
+    extract: the folder for the images. With None, they go into a temporary folder that is removed when the program ends.
     with_images: whether images are read. with_range: whether boxes get depths from the depth images.
     """
 

@@ -1,7 +1,7 @@
-"""Read a recording once, and keep the times of every topic and the messages that objslam may use.
+"""Read a recording once. Keep the times of every topic, and the messages that objslam may use.
 
-All poses, transforms, boxes and calibrations are kept, because they are small. For images, only the times and the first
-message of each topic are kept.
+All poses, transforms and boxes are kept, because they are small. Only two different calibrations and the first image of a
+topic are kept.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGE, ODO
 from objslam.ros.tf.tree import TfRows
 from objslam.ros.topics import namespace
 
-_MAX_TOPICS = 10_000  # The most topics that are read. Messages of other topics count as lost. A larger number costs memory.
+_MAX_TOPICS = 10_000  # The most topics that are read. Messages of other topics count as damage. More topics: more memory.
 _Decoder = Callable[[bytes], Any]
 _Handler = Callable[[bytes, int], None]
 
@@ -34,11 +34,11 @@ _Handler = Callable[[bytes, int], None]
 class Topic:
     """The content of a topic.
 
-    logged: the times of recording, ns. stamps: the header stamps, ns, if objslam uses messages of this type (not for tf).
-    frames: how many messages have each frame_id. refused: the count of unusable messages by reason. poses: the poses by
-    (frame, child frame). tracks: the track id of each track whose name is no number. points: centre and corners (5, 3), m,
-    of each tag without a box, by the index of the tag in `boxes`. infos: up to two different CameraInfo messages, by their
-    bytes without the stamp. image: the first image, decoded.
+    logged: the times of recording, ns. stamps: the header stamps, ns. They are empty for tf and for types that objslam does
+    not use. frames: the number of messages with each frame_id. refused: the number of unusable messages for each reason.
+    poses: the poses by (frame, child frame). tracks: the track id of each track whose name is no number. points: maps the
+    index in `boxes` of each tag without a box to its centre and corners (5, 3), m. infos: up to two different CameraInfo
+    messages, by their bytes without the stamp. image: the first image, decoded.
     """
 
     connection: Connection
@@ -75,7 +75,8 @@ class Topic:
 
 @dataclass(frozen=True)
 class Survey:
-    """The topics of a recording by name, the transforms of its tf topics by namespace, and a report on each file."""
+    """The content of a recording. topics: the topics by name. tf: the transforms of the tf topics by namespace. reports: a
+    report on each file."""
 
     recording: Recording
     topics: dict[str, Topic]
@@ -88,9 +89,9 @@ class Survey:
 
 
 def take_survey(recording: Recording, label: str) -> Survey:
-    """Read a recording once. `label` is the label of boxes without a class.
+    """Read a recording once, and return its content. label: the label of boxes without a class.
 
-    Damage is counted in the reports, and unusable messages in the topics. Raises LogError if no file can be read.
+    The reports count damage, and the topics count unusable messages. Raises LogError if no file can be read.
     """
     topics: dict[str, Topic] = {}
     tf: dict[str, TfRows] = {}

@@ -1,4 +1,4 @@
-"""Choose the tf topics of one robot. Robots in namespaces often have frames of the same names, each on its own tf topic."""
+"""Choose the tf topics of one robot. Several robots often use the same frame names, each on its own tf topic."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -14,17 +14,18 @@ from objslam.sources.ros_bag.survey import Topic
 from objslam.sources.ros_bag.topic_roles import TopicPool, candidates
 
 _REPEATED = 0.5
-"""If both topics have this share of the samples of a transform, counted on the topic with fewer samples, one topic repeats
-the other, as a relay does. Otherwise they belong to two robots. It lies halfway between two robots, which hardly share a
-sample, and a relay, which shares nearly all. With a larger value, a relay that alters some samples counts as a robot."""
+"""The least share of the samples of a transform, on the topic with fewer samples, that the other topic also has if one topic
+repeats the other, as a relay does. With a smaller share, the topics belong to two robots. Two robots share hardly a sample,
+and a relay shares nearly all. With a larger value, a relay that changes some samples counts as another robot."""
 
 
 def choose_robot(pool: TopicPool) -> tuple[TfRows, TopicPool]:
-    """Return the transforms of one robot, and the topics without those of other robots.
+    """Return the transforms of one robot, and the topics without the topics of other robots.
 
-    All namespaces of tf topics are used, unless two of them have other samples of the same moving transform. Then the user's
-    choice (`--topic tf=...`) decides, else the namespace of the topics that the user chose for other roles, else that of the
-    first topic of odometry, boxes or images. A warning names the others. Topics that the user chose always stay.
+    All namespaces of tf topics are used if the user chose none and no two namespaces have different samples of the same
+    moving transform. The user's choice (`--topic tf=...`) has priority. Without this choice, the namespace of the topics
+    that the user chose for other roles comes first, then the namespace of the first topic of odometry, boxes or images. A
+    warning names the namespaces that are left out. Topics that the user chose always stay.
     """
     by_space, topics = pool.survey.tf, pool.survey.topics
     chosen = [name for role in TF_ROLES for name in pool.choices.of(role)]
@@ -41,14 +42,14 @@ def choose_robot(pool: TopicPool) -> tuple[TfRows, TopicPool]:
 
 
 def _space_of(topic: Topic, spaces: Iterable[str]) -> str | None:
-    """Return the namespace of tf that a topic is in, None for a topic in no namespace."""
+    """Return the namespace of tf that contains a topic, or None if no namespace contains it."""
     if topic.type in TRANSFORMS:
         return namespace(topic.name)
     return max((space for space in spaces if space and topic.name.startswith(f"{space}/")), key=len, default=None)
 
 
 def _by_priority(pool: TopicPool, by_space: Mapping[str, TfRows]) -> list[str]:
-    """Return the namespaces, the robot's first: the longest that contains a topic of the robot."""
+    """Return the namespaces of tf in the order of priority. The longest one that contains the robot's topic is first."""
     named = [name for (_, role), names in pool.choices.names.items() if role not in TF_ROLES for name in names]
     named = [name for name in named if name not in (NONE, TF)]
     found = [found[0].name for role in ("odometry", "detections", "image") if (found := candidates(pool.survey, role))]
@@ -58,7 +59,7 @@ def _by_priority(pool: TopicPool, by_space: Mapping[str, TfRows]) -> list[str]:
 
 
 def _differ(one: TfRows, other: TfRows) -> bool:
-    """Return whether two namespaces give the same moving transform with other samples."""
+    """Return whether two namespaces have different samples of the same moving transform."""
     return any(not _repeats(one.moving[pair], other.moving[pair]) for pair in one.moving.keys() & other.moving.keys())
 
 
@@ -68,7 +69,7 @@ def _repeats(one: PoseRows, other: PoseRows) -> bool:
 
 
 def _samples(rows: PoseRows) -> NDArray[np.void]:
-    """Return the different samples (N,) of a transform, each as the bytes of its stamp and pose."""
+    """Return the samples (N,) of a transform without repeats. Each sample is the bytes of its stamp and pose."""
     stamps, values = np.frombuffer(rows.stamps, dtype=np.int64), np.frombuffer(rows.values).reshape(-1, 7)
     table = np.column_stack([stamps.view(np.float64), values])
     return np.unique(table.view(np.dtype((np.void, table.strides[0])))[:, 0])

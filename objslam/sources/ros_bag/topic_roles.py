@@ -1,4 +1,4 @@
-"""Choose the topic for each role in a run, by type and content."""
+"""Choose the topic for each role in a run, by the type and the content of the topics."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGES, OD
 from objslam.ros.topics import FROM_TF, LISTED, NONE, TF, TF_ROLES, Choices, warn_of_choice
 from objslam.sources.ros_bag.survey import Survey, Topic
 
-_DEPTH_ENCODINGS = ("16uc1", "32fc1")  # The encodings of depth images only. Grey images also have mono16.
+_DEPTH_ENCODINGS = ("16uc1", "32fc1")  # The encodings that only depth images have. Depth and grey images can have mono16.
 
 
 def check_choices(choices: Choices, survey: Survey) -> None:
@@ -35,14 +35,15 @@ class TopicPool:
     ledger: Ledger
 
     def fitting(self, role: str) -> list[Topic]:
-        """Return the topics that fit a role. If the user chose topics for the role, the others are left out."""
+        """Return the topics that fit a role. If the user chose topics for the role, all other topics are left out."""
         names = self.choices.of(role)
         return [topic for topic in candidates(self.survey, role) if not names or topic.name in names]
 
     def choose(self, role: str, fitting: Sequence[Topic], camera: str = "") -> Topic | None:
         """Return the topic that the user chose for a role of a camera. Without a choice, return the first of `fitting`.
 
-        Warns if there is no choice and several topics fit. Returns None if no topic fits, or the user chose `none` or `tf`.
+        Warn if the user made no choice and several topics fit. Return None if no topic fits, or if the user chose `none` or
+        `tf`.
         """
         names = self.choices.names.get((camera, role))
         if names:

@@ -1,4 +1,4 @@
-"""Read the robot's path, odometry and localisation, from topics and the tf tree."""
+"""Read the robot's paths (odometry and localisation) from topics and the tf tree."""
 
 from dataclasses import dataclass, field, replace
 
@@ -17,15 +17,16 @@ from objslam.sources.ros_bag.survey import Survey, Topic
 from objslam.sources.ros_bag.topic_roles import TopicPool, candidates
 
 _NOT_THE_ROBOT = ("goal", "target", "initial", "setpoint", "waypoint", "truth", "mocap", "vrpn", "vicon")
-"""A topic of poses with one of these words in its name is not the robot's own estimate of its pose."""
+"""Words in the names of topics whose poses are not the robot's own estimate of its pose. Without a choice of the user, these
+topics are not used."""
 
 
 @dataclass(frozen=True)
 class Paths:
     """The robot's paths. base: the name of the base frame. odometry: odom_T_base. localization: map_T_base.
 
-    odometry_from, localization_from: the topic or transform that gives the path, as text for the user, "" without the path.
-    roles: the role of each topic that is used, by the topic's name.
+    odometry_from, localization_from: a text for the user that names the topic or transform of the path, "" without the path.
+    roles: maps the name of each topic that is used to its role.
     """
 
     base: str
@@ -48,13 +49,14 @@ class _Odometry:
 
 
 def read_paths(pool: TopicPool, tree: TfTree, base_frame: str | None) -> Paths:
-    """Read the odometry and the localisation of the robot's base.
+    """Return the odometry and the localisation of the robot's base.
 
-    The odometry comes from a nav_msgs/Odometry topic. Without such a topic, it is tf from odom to base. The localisation is
-    tf from map to odom, composed with the odometry at the odometry's stamps. If the odometry's frame is not in tf, the
-    localisation is tf from map to base. Without map in tf, it comes from a topic of poses in map. If map never moves against
-    odom, the odometry is converted to map and there is no localisation. The user may choose other topics, or tf. Raises
-    LogError if both paths are missing, if a topic has no usable pose, or if tf does not connect a necessary frame.
+    The odometry comes from a nav_msgs/Odometry topic. Without such a topic, the odometry is tf from odom to base. The
+    localisation is tf from map to odom, multiplied by the odometry at the odometry's stamps. If the odometry's frame is not
+    in tf, the localisation is tf from map to base. If map is not in tf, the localisation comes from a topic of poses in map.
+    If map never moves against odom, the odometry is converted to map, and the localisation is None. The user may choose
+    other topics, or tf. Raises LogError if both paths are missing, if a topic has no usable pose, or if tf does not connect
+    a necessary frame.
     """
     ledger = pool.ledger
     topics = [topic for topic in candidates(pool.survey, "odometry") if not is_world(_main_pair(topic)[0])]
@@ -87,9 +89,9 @@ def _main_pair(topic: Topic) -> tuple[str, str]:
 
 
 def _from_topic(topic: Topic, what: str, ledger: Ledger) -> _Odometry:
-    """Read the poses of a topic. Messages that name other coordinate frames than most messages are dropped and counted.
+    """Return the poses of a topic. Messages with other frames than the most frequent pair of frames are dropped and counted.
 
-    what: the name of a message in the reasons. Raises LogError if no pose is usable.
+    what: the name of a message in the ledger. Raises LogError if no pose is usable.
     """
     pair = _main_pair(topic)
     for other, rows in topic.poses.items():
@@ -129,14 +131,14 @@ def _odometry_from_tf(tree: TfTree, base: str) -> _Odometry | None:
 
 
 def tf_path(tree: TfTree, frame: str, child: str) -> tuple[Floats, Floats]:
-    """Return the stamps (N,), s, at which tf knows the pose of the frame `child` in `frame`, and these poses (N, 4, 4)."""
+    """Return the stamps (N,), s, at which tf has the pose of the frame `child` in `frame`, and the poses (N, 4, 4)."""
     stamps = tree.stamps(frame, child)
     poses, known = tree.at(frame, child, stamps)
     return stamps[known], poses[known]
 
 
 def _localized(pool: TopicPool, tree: TfTree, odometry: _Odometry | None, base: str) -> Paths:
-    """Return the odometry and the localisation. Without a choice of the user, tf is tried before the topics of poses."""
+    """Return the odometry and the localisation. If the user made no choice, tf is tried before the topics of poses."""
     chosen = pool.choices.of("localization")
     path, source = (None, "") if odometry is None else (Trajectory(odometry.stamps, odometry.poses), odometry.source)
     if chosen in ([], [TF]):
@@ -161,10 +163,10 @@ def _pose_topics(survey: Survey) -> list[Topic]:
 
 
 def _from_tf(tree: TfTree, odometry: _Odometry | None, base: str) -> tuple[Floats, Floats, str] | None:
-    """Read the localisation from tf. Returns its stamps (N,), s, the poses map_T_base (N, 4, 4), and their source as text.
+    """Return the localisation from tf: stamps (N,), s, poses map_T_base (N, 4, 4), and a text that names the source.
 
-    If map does not move against odom, there are no stamps, and the fixed map_T_odom (4, 4) takes the place of the poses.
-    Returns None if tf has no localisation.
+    If map does not move against odom, the stamps are empty, and the fixed map_T_odom (4, 4) is returned instead of the
+    poses. Return None if tf has no localisation.
     """
     frame = odometry.frame if odometry is not None and odometry.frame in tree.frames else base
     if frame not in tree.frames:

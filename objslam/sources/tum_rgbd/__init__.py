@@ -1,4 +1,4 @@
-"""The options of TUM RGB-D datasets. The folders are read in `reader`, which `--help` does not import."""
+"""The options of TUM RGB-D datasets. The module `reader` reads the folders. `--help` does not import `reader`."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,8 @@ from objslam.sources.options import Label, WithRange
 
 @dataclass(frozen=True)
 class TumOptions:
-    """Choices that the folder leaves open: the label of boxes without a class, and whether depth images give ranges."""
+    """The options of a TUM dataset. label: the label of boxes without a class. with_range: whether boxes get depths from the
+    depth images."""
 
     label: Label = None
     with_range: WithRange = True

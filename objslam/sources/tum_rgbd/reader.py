@@ -2,8 +2,8 @@
 
 The numbered layout is the layout of the cube_slam sample. truth_cam_poses.txt has a pose for each image. The names of files
 in boxes/, raw_imgs/ and depth_imgs/ begin with the number of the image, from 0. The stamped layout is the layout of the
-benchmark, with groundtruth.txt, rgb.txt, depth.txt, and box files named after stamps. The poses are camera poses, so the
-base frame is the camera's frame.
+benchmark. It has groundtruth.txt, rgb.txt, depth.txt, and box files whose names are stamps. The poses are camera poses, so
+the base frame is the camera's frame.
 """
 
 import lzma
@@ -35,9 +35,9 @@ from objslam.sources.tum_rgbd import TumOptions
 _POSES, _BOXES, _IMAGES = "truth_cam_poses.txt", "boxes", ("raw_imgs", "depth_imgs")  # The names in the numbered layout.
 _PATHS = ("groundtruth.txt", "groundtruth.txt.gz")  # The possible names of the file of poses in the stamped layout.
 _LABEL = "object"  # The default label of boxes without a class.
-_DEPTH_SCALE = 5000.0  # The units per metre of the benchmark's depth images.
+_DEPTH_SCALE = 5000.0  # The depth scale of the benchmark's depth images, units per metre.
 _FREIBURG3 = np.array([[535.4, 0.0, 320.1], [0.0, 539.2, 247.6], [0.0, 0.0, 1.0]])
-"""The camera matrix of freiburg3, px, from the benchmark."""
+"""The camera matrix of the camera freiburg3, px, from the benchmark."""
 _STAMPED = re.compile(r"(\d+\.\d+)\.txt")  # The name of a box file, a stamp in s.
 _ARCHIVES = ("*.tar", "*.tar.gz", "*.tgz", "*.tar.bz2", "*.tar.xz")  # The names of archives that may hold box files.
 _MAX_SIZE = 1 << 20  # The largest box file in an archive, bytes. A usual file has a few hundred bytes.
@@ -46,21 +46,21 @@ _BAD_ARCHIVE = (tarfile.TarError, EOFError, zlib.error, lzma.LZMAError, OSError,
 
 
 def is_numbered(path: Path) -> bool:
-    """Return whether the folder has the numbered layout."""
+    """Return whether the folder has the files of the numbered layout."""
     return (path / _POSES).is_file() and (path / _BOXES).is_dir()
 
 
 def is_stamped(path: Path) -> bool:
-    """Return whether the folder has the stamped layout."""
+    """Return whether the folder has the files of the stamped layout."""
     return _stamped_path(path) is not None and ((path / "rgb.txt").is_file() or bool(_find_box_sets(path)))
 
 
 def read_numbered(path: Path, ledger: Ledger, options: TumOptions = TumOptions()) -> Log:
-    """Read the numbered layout.
+    """Return the log of a folder in the numbered layout.
 
     A file whose name begins with the number n belongs to pose line n. Pose lines are counted from 0, and comments are not
-    counted. Without camera.yaml, the calibration is of freiburg3. Files without a pose, and further files with the same
-    number, are dropped and counted. Raises LogError if the poses or the boxes are unusable.
+    counted. Without camera.yaml, the calibration of freiburg3 is used. Files without a pose are dropped and counted, and so
+    are further files with the same number. Raises LogError if the poses or the boxes are unusable.
     """
     with reading(path):
         table = read_pose_table(path / _POSES, ledger)
@@ -76,10 +76,10 @@ def read_numbered(path: Path, ledger: Ledger, options: TumOptions = TumOptions()
 
 
 def read_stamped(path: Path, ledger: Ledger, options: TumOptions = TumOptions()) -> Log:
-    """Read the stamped layout. Boxes are optional if the folder has rgb.txt.
+    """Return the log of a folder in the stamped layout. Boxes are optional if the folder has rgb.txt.
 
-    The box files are in a folder or in a tar archive. The archive is not unpacked to disk. Box files that are not regular
-    files, that are not named after a stamp, or that are too large (in an archive) are dropped and counted.
+    The box files are in a folder or in a tar archive. The archive is not unpacked to disk. Box files are dropped and counted
+    if they are not regular files, if their names are not stamps, or if they are too large (in an archive).
     Raises LogError if the poses or the boxes are unusable, or if the folder has several sets of boxes.
     """
     with reading(path):
@@ -129,7 +129,7 @@ def _numbered_images(folder: Path, stamp_of: dict[int, float], ledger: Ledger) -
 
 
 def _numbered(folder: Path, stamp_of: dict[int, float], ledger: Ledger) -> dict[int, Path]:
-    """Return the files of a folder by the number at the start of their name, in the order of the numbers."""
+    """Return the files of a folder, in the order of the numbers at the start of their names. These numbers are the keys."""
     inside = Inside(folder)
     found: dict[int, Path] = {}
     for file in sorted(folder.iterdir()):
@@ -154,7 +154,7 @@ def _find_box_sets(folder: Path) -> list[Path]:
 
 
 def _read_box_set(source: Path, label: str, ledger: Ledger) -> Detections:
-    """Read a set of box files in the order of their stamps. An archive is read up to its first damage."""
+    """Return the detections of a set of box files, in the order of stamps. An archive is read up to its first damage."""
     files = _archive_files(source, ledger) if source.is_file() else _folder_files(source, ledger)
     collector = BoxCollector()
     for stamp, place, data in sorted(files, key=lambda file: file[0]):
@@ -166,7 +166,8 @@ def _read_box_set(source: Path, label: str, ledger: Ledger) -> Detections:
 
 
 def _add_boxes(data: bytes, place: str, label: str, collector: BoxCollector, ledger: Ledger) -> None:
-    """Add the boxes of a file to the collector's last frame. In a line, x and y are the top left corner of the box, px."""
+    """Add the boxes of a file to the collector's last frame. Each line is "[class] x y w h score", px, with the top left
+    corner x, y."""
     for number, text in split_lines(data, place, ledger):
         where = f"{place}:{number}"
         values = parse_numbers(text.split())

@@ -1,6 +1,7 @@
 """The formats of `objslam export`, with one module for each format. Code that several formats share is in `output.export`.
 
-Every command imports these modules at its start, so they import slow libraries (numpy too) inside their functions.
+Every command imports these modules at its start. These modules therefore import slow packages, including numpy, only inside
+their functions.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""The CSV format (RFC 4180): one line per object, for spreadsheets and data frames."""
+"""The CSV format (RFC 4180) for spreadsheets and data frames. Each object is one line."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
     from objslam.output.export.content import Content
 
 _FORMULA = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
-"""The characters that start a formula in a spreadsheet, also in their full-width forms."""
+"""The characters that start a formula in a spreadsheet. The last four are the full-width forms of the first four."""
 
 
 def _dump(content: Content) -> bytes:
-    """Return the objects as UTF-8 text. Objects that are gone come last. Numbers have all digits of their floats. An unknown
-    value is empty.
+    """Return the objects as UTF-8 text. Objects that are gone come last. Numbers have all digits of their floats.
 
-    A label that a spreadsheet would take for a formula gets an apostrophe in front, as OWASP advises against CSV injection.
+    The cell of an unknown value is empty. A label that a spreadsheet would take for a formula gets an apostrophe in front.
+    OWASP advises this against CSV injection.
     """
     from objslam.core.object_map import COLUMNS
 

@@ -50,7 +50,7 @@ def _dump(content: Content) -> bytes:
 
 
 def _numbers(poses: Floats, *more: Any) -> list[str]:
-    """Return a text for each pose (N, 4, 4): its x, y, z, its quaternion (x, y, z, w), and its rows in the arrays `more`."""
+    """Return a text for each pose (N, 4, 4): x, y, z, the quaternion (x, y, z, w), and the row of each array in `more`."""
     import numpy as np
 
     from objslam.core.geometry import quaternion

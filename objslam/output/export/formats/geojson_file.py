@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from objslam.core.object_map import MapObject
     from objslam.output.export.content import Content, Datum
 
-_DEGREE_DIGITS = 9  # Longitudes and latitudes, deg, have this many decimal places. 1e-9 deg is 0.1 mm on the ground.
-_METRE_DIGITS = 6  # Coordinates, m, have this many decimal places. 1e-6 m is far below the accuracy of any map.
+_DEGREE_DIGITS = 9  # The number of decimal places of longitudes and latitudes, deg. 1e-9 deg is 0.1 mm on the ground.
+_METRE_DIGITS = 6  # The number of decimal places of coordinates, m. 1e-6 m is far below the error of any map.
 
 
 def _dump(content: Content) -> bytes:
@@ -23,7 +23,7 @@ def _dump(content: Content) -> bytes:
     With a datum, coordinates are WGS 84 longitude and latitude, as the RFC requires. Without a datum, coordinates are in m,
     in the map's frame, and the member `coordinates_in` names this frame. Heights are properties, because the height of a map
     above the ellipsoid is unknown. An object with a body has a second feature, its footprint. An unresolved object is a
-    feature without a geometry. In the map of a site, an object has its `state`, and objects that are gone come too.
+    feature without a geometry. In the map of a site, each object has its `state`, and objects that are gone are included.
     """
     datum, path = content.datum, content.path
     features = [_object(o, datum) for o in (*content.objects.objects, *content.objects.gone)]
@@ -59,9 +59,9 @@ def _object(o: MapObject, datum: Datum | None) -> dict[str, Any]:
 
 
 def _footprint(o: MapObject, datum: Datum | None) -> dict[str, Any] | None:
-    """Return the footprint of an object's body, as map.png draws it. None without an outline.
+    """Return the footprint of an object's body, as map.png draws it. Return None if the body has no outline.
 
-    The corners go counter-clockwise, and the last is the first, as the RFC asks.
+    The corners are in counter-clockwise order. The last corner repeats the first, as the RFC requires.
     """
     import numpy as np
 

@@ -14,21 +14,21 @@ from objslam.output.export.export_format import ExportFormat
 if TYPE_CHECKING:
     from objslam.output.export.content import Content
 
-_POSE_TOPIC = "/objslam/pose"  # This topic has the robot's pose at each stamp. Every other topic has one message, latched.
+_POSE_TOPIC = "/objslam/pose"  # The topic with the robot's pose at each stamp. Every other topic has one latched message.
 _LATCHED = (
     "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
     "  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n  liveliness: 1\n  liveliness_lease_duration:\n"
     "    sec: 9223372036\n    nsec: 854775807\n  avoid_ros_namespace_conventions: false"
 )
-"""The offered QoS, as rosbag2 writes it: reliable and transient local, so that a late RViz gets the map too."""
+"""The offered QoS in the form of rosbag2. It is reliable and transient local, so an RViz that starts later gets the map."""
 
 
 def _dump(content: Content) -> bytes:
-    """Return the content of the MCAP file. OutputError if the stamps of the path lie before 1970 or after 2038.
+    """Return the content of the MCAP file. Raises OutputError if a stamp of the path is before 1970 or after 2038.
 
     One message has all resolved objects with their covariances, one has all markers, and one has the whole path. These three
-    messages have the first stamp of the path. A further message at each stamp of the path has the robot's pose. Each chunk
-    has a CRC.
+    messages have the first stamp of the path. For each stamp of the path, one message has the robot's pose. Each chunk has
+    a CRC.
     """
     from mcap.writer import CompressionType, Writer
 

@@ -1,4 +1,4 @@
-"""The view of a running session: a separate process that logs to the viewer, and the messages to this process.
+"""Show a running session. A separate process logs to the viewer, and the session sends messages to this process.
 
-The recording of a finished run is made in `viewer`.
+`viewer` makes the recording of a finished run.
 """

@@ -1,7 +1,7 @@
 """The process that logs the snapshots of a session to a viewer or a file.
 
-If a viewer hangs, rerun's connection blocks, and the process with this connection cannot end. Therefore the connection is in
-a process of its own, which the session can kill.
+If a viewer hangs, rerun's connection blocks, and the process with this connection cannot end. The connection is therefore in
+a separate process, which the session can kill.
 
 Start: `python -m objslam.output.viewer.live.live_process [--file FILE] [--address URL]`. The process reads messages from
 stdin. It answers each message with a line: "ok" if the viewer or the file has received the message, "lost" if this is not
@@ -71,7 +71,10 @@ def _connect(recording: Any, options: argparse.Namespace) -> None:
 
 
 def _delivered(recording: Any, parent: int) -> bool:
-    """Wait until the logged data have arrived. Return False if they are lost. Exit if the session has ended meanwhile."""
+    """Wait until the logged data have arrived, and return True. Return False if the data are lost.
+
+    The process exits if the session ends during this time. parent: the process id of the session.
+    """
     while True:
         try:
             recording.flush(timeout_sec=1.0)
@@ -167,7 +170,7 @@ def _transform(pose: Floats) -> rr.Transform3D:
 
 
 def _rays(frame: CameraFrame, objects: ObjectMap, index: Ints) -> NDArray[np.float32]:
-    """Return the rays of the boxes as lines (B, 2, 3), m in map. `index` (B,) is the object of each box, or -1.
+    """Return the rays of the boxes as lines (B, 2, 3) in map, m. index: (B,) index of the object of each box, or -1.
 
     A ray starts at the camera and is as long as the distance to its object, or `_FREE_REACH` long without an object.
     """

@@ -1,4 +1,4 @@
-"""The view of a running session: its snapshots go to a viewer or a file, and the session never waits for them."""
+"""Show the snapshots of a running session in a viewer, or write them to a file. The session never waits for this."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from objslam.core.snapshot import Snapshot
 
-_MAX_WAITING = 4  # The most snapshots that wait for the viewer. Beyond that, the oldest is dropped.
+_MAX_WAITING = 4  # The largest number of snapshots that wait for the viewer. If one more comes, the oldest is dropped.
 _ADDRESS = re.compile(r"rerun(\+https?)?://[^/\s]+/proxy")  # The form of a viewer's address.
 
 Image = Callable[[str, float], "NDArray[np.uint8] | bytes | None"]
@@ -33,12 +33,12 @@ Image = Callable[[str, float], "NDArray[np.uint8] | bytes | None"]
 
 
 def open_view(where: str, say: Callable[[str], None], image: Image | None = None) -> LiveView:
-    """Open a live view.
+    """Return a new live view.
 
     Args:
         where: `window`, `web` for a browser, the name of a recording (.rrd), or the address of a viewer.
-        say: receives a line with the address for the browser.
-        image: finds the images of camera frames.
+        say: a function that gets a line with the address for the browser.
+        image: a function that finds the images of camera frames.
     """
     if where.endswith(".rrd"):
         return LiveView(file=Path(where), image=image)
@@ -58,9 +58,9 @@ def open_view(where: str, say: Callable[[str], None], image: Image | None = None
 class LiveView:
     """A view that shows the snapshots of a session. If the viewer is too slow, snapshots are dropped and counted.
 
-    A separate process logs the snapshots, and a thread feeds this process. So a hanging viewer cannot block the session or
-    its end. If the viewer is killed, the process tries its address every few seconds. A new viewer there gets the later
-    snapshots.
+    A separate process logs the snapshots, and a thread feeds this process. A viewer that hangs can therefore not block the
+    session or its end. If the viewer is killed, the process tries its address every few seconds. A new viewer at this
+    address gets the later snapshots.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class LiveView:
 
         Args:
             file: the recording. It can be read at any time.
-            image: finds the images of camera frames. The thread of the view calls this function.
+            image: a function that finds the images of camera frames. The thread of the view calls this function.
             server: a viewer to stop at the end.
         Raises:
             ConfigError: the address is malformed.
@@ -106,7 +106,7 @@ class LiveView:
         start_thread(self._thread)
 
     def show(self, snapshot: Snapshot) -> bool:
-        """Queue a snapshot and return at once. Any thread may call this. Return False if an older snapshot was dropped."""
+        """Queue a snapshot and return at once. Return False if an older snapshot was dropped. Any thread may call this."""
         with self._changed:
             full = len(self._waiting) >= _MAX_WAITING
             if full:
@@ -117,7 +117,7 @@ class LiveView:
         return not full
 
     def close(self, timeout: float = 3.0) -> None:
-        """Wait until the queued snapshots are shown, at most `timeout`, s. Then end the process."""
+        """Wait at most `timeout` (s) until the queued snapshots are shown, and end the process."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()

@@ -1,4 +1,4 @@
-"""The messages from a session to its view process: JSON, followed by the images."""
+"""Write and read the messages from a session to its view process. A message is JSON, followed by the images."""
 
 import json
 import struct
@@ -15,9 +15,9 @@ from objslam.io.objects_json import dump_objects, parse_objects
 from objslam.output.plot.style import evenly
 from objslam.output.viewer.images import pack
 
-_LENGTH = struct.Struct("<Q")  # A message begins with the length of its JSON text, bytes.
-_MAX_POINTS = 500  # The most points of the path in a message.
-_MAX_LENGTH = 1 << 30  # The most bytes of text that are read, so that a damaged length does not fill the memory.
+_LENGTH = struct.Struct("<Q")  # The first bytes of a message: the length of its JSON text, bytes.
+_MAX_POINTS = 500  # The largest number of points of the path in a message.
+_MAX_LENGTH = 1 << 30  # The largest length of a text that is read, bytes. A damaged length then does not fill the memory.
 _CAMERA = ("name", "width", "height", "matrix", "distortion_model", "distortion")  # The fields of a camera in a message.
 _FRAME = ("stamp", "map_T_camera", "boxes", "objects", "rejected")  # The fields of a frame in a message.
 
@@ -36,7 +36,7 @@ class ShownSnapshot:
 
 
 def encode_snapshot(snapshot: Snapshot, unseen: int = 0) -> bytes:
-    """Encode a snapshot as one message. unseen: the number of snapshots that were dropped before it."""
+    """Return a snapshot as one message. unseen: the number of snapshots that were dropped before this one."""
     frames, path, (p50, p99) = snapshot.frames, snapshot.path, snapshot.update
     numbers = {"lag": snapshot.lag, "p50": p50, "p99": p99, "unseen": unseen}
     numbers |= {"keyframes": snapshot.keyframes, "rebuilds": snapshot.rebuilds}
@@ -57,7 +57,8 @@ def encode_snapshot(snapshot: Snapshot, unseen: int = 0) -> bytes:
 
 
 def read_snapshot(stream: BinaryIO) -> tuple[ShownSnapshot, list[CameraFrame]] | None:
-    """Return the snapshot and the camera frames of a stream's next message. None at the end or if the message is cut off."""
+    """Return the snapshot and the camera frames of a stream's next message. Return None at the end of the stream, or if the
+    message is cut off."""
     start = stream.read(_LENGTH.size)
     if len(start) < _LENGTH.size:
         return None
