@@ -1,1 +1,1 @@
-"""The bodies of objects, which have a shape, a size and a heading, and the boxes around them."""
+"""The bodies of objects, with shape, size and heading. Their upright boxes, footprints and overlaps are here too."""
