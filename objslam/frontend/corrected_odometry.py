@@ -180,7 +180,8 @@ class CorrectablePath:
     def _headings_and_places(
         self, turn_scale: float, turn_bias: float, per_m: float, slip: float, lateral: float
     ) -> tuple[Floats, Floats]:
-        """Return by how much (N,), rad, the errors turn each pose, and the places (3, N), m, seen from the first pose.
+        """Return two arrays: the change (N,), rad, of each heading by the errors, and the corrected places (3, N), m, seen
+        from the first pose.
 
         The scale is not in the places, because it only multiplies them.
         """

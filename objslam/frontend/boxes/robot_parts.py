@@ -46,8 +46,9 @@ TURN = np.radians(30.0)
 """The angle (rad) by which the camera turns in a window. Odometry is good over such a turn, and a thing at rest moves by
 much of the image. A larger angle needs more turning."""
 ABSENT = 10.0
-"""The gap between two boxes at which a window ends, as a multiple of the usual gap. A part of the robot stays while the
-camera turns. Things that the robot meets again on its way come and go. A larger number drops more boxes."""
+"""A window ends at a gap (frames) between consecutive boxes of a place above this multiple of the usual gap. A part of the
+robot stays while the camera turns. Things that the robot meets again on its way come and go. A larger number drops more
+boxes."""
 _MISSED = np.radians(5.0)
 """The angle (rad, root mean square) by which rays miss the point that fits them best. A window with a larger angle shows no
 thing at rest. The errors of poses are smaller over such a turn. If the camera turns in its place, rays of boxes that stay in
@@ -60,9 +61,9 @@ NEXT = 2
 three windows. With 1, a part of the robot was not found for a camera that looks to the side, because the curves of the robot
 changed slowly. A larger number drops more boxes."""
 _DRIFTING = 4.0
-"""The mean change of boxes from one image to the next above which the boxes drift, in standard deviations of this mean. A
-robot that drives along a row of equal things sees one thing after another at the same place of the image, and each grows or
-moves on. Boxes of a part of the robot change by noise alone. A larger number drops more boxes."""
+"""Boxes drift if the mean change of a coordinate from one image to the next exceeds this number of standard deviations of
+the mean. A robot that drives along a row of equal things sees one thing after another at the same place of the image, and
+each grows or moves on. Boxes of a part of the robot change by noise alone. A larger number drops more boxes."""
 WINDOWS, AGREE = 3, 0.8
 """`WINDOWS` is the least number, and `AGREE` the least share, of the windows that must show no thing at rest. Larger values
 drop fewer boxes. Two boxes are enough for a window, because rays of a part of the robot mostly meet behind the camera."""

@@ -21,9 +21,9 @@ from objslam.core.types import CameraLog, Detections, Log
 SECOND_LABELS = "boxes on a surer box with another label (second labels of things; rays.second_labels)"
 """The reason to drop boxes with second labels."""
 _NEARLY_EQUAL = 0.8
-"""The least intersection over union of two nearly equal boxes. Equal boxes that are a ninth of their width apart have this
-value. Second boxes whose edges err by 2 % of their size have 0.85 and more. With a larger value, second labels with noisier
-edges become objects."""
+"""The least intersection over union of two nearly equal boxes. Two boxes of equal size, one of them shifted sideways by a
+ninth of its width, have this value. Second boxes whose edges err by 2 % of their size have 0.85 and more. With a larger
+value, second labels with noisier edges become objects."""
 _MOST = 0.5
 """The least share of nearly equal boxes, among the boxes of two labels that lie on each other, if both are labels of one
 thing. Equally large boxes that pass each other sideways have a share of 0.22. They lie on each other if they are less than

@@ -121,7 +121,7 @@ class ComparedPoses:
         return found
 
     def _own(self, kind: ErrorKind, nominal: float) -> Floats:
-        """Return the covariance (n, n) of the error of headings or of places. nominal: its standard deviation, rad or m."""
+        """Return the covariance (n, n), rad^2 or m^2, of errors of n headings or places. nominal: their sigma, rad or m."""
         variance, lasting = (nominal * np.exp(kind.factor)) ** 2, kind.lasting
         own = variance * (1 - lasting.share) * self.white
         return own + variance * lasting.share * self.alike[kind.time] if lasting.share else own

@@ -81,7 +81,8 @@ class TagCorners:
         return replace(self, side=_sides(names, self.association.label[self.object], settings))
 
     def rays(self, rays: Rays) -> Rays:
-        """Return the new rays (n,) of the rays (R,). A ray to a corner has the noise of a corner, and no range."""
+        """Return the rays (n,) in which rays to corners replace the rays to fiducials. rays: (R,) the original rays. A ray
+        to a corner has the noise of a corner, and no range."""
         assert rays.corners is not None
         assert rays.corner_sigma is not None
         new = rays.take(self.source)

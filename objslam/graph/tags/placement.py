@@ -20,8 +20,8 @@ _STEPS, _STEPS_LAST = 6, 15
 """The numbers of iterations of a fit to one view, and of the last fit. Larger numbers are slower. Both fits usually converge
 in five iterations."""
 _TOLD = 4.0
-"""The information about the logarithm of the side above which a fiducial of unknown size gets a pose. The value is
-1 / 0.5^2. With a larger value, fewer such fiducials get a pose."""
+"""A fiducial of unknown size gets a pose only if the information about the logarithm of its side exceeds this value. The
+value is 1 / 0.5^2. With a larger value, fewer such fiducials get a pose."""
 _SAME = np.radians(3.0)
 """The largest angle (rad) between two poses that count as one. With a larger angle, more fiducials have a single pose."""
 _CLEARLY = 1.0

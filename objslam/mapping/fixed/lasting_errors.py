@@ -125,8 +125,8 @@ def check_lasting_noise(noise: LastingNoise, settings: Settings, log: Log) -> Fi
 
 
 def _cells_of(solution: Solution, settings: Settings) -> list[Cells]:
-    """Return the cells of all objects with a covariance. For planar poses on uneven ground, a second entry has the misses up
-    and down. Rejected rays and ranges do not count."""
+    """Return the cells of all objects with a covariance. For planar poses on uneven ground, the list has a second item, with
+    the misses up and down. Rejected rays and ranges do not count."""
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     placed = np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(estimate.positions[:, 0])
     which = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))

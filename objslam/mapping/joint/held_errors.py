@@ -178,8 +178,8 @@ def check_turned_camera(errors: SharedErrors, solution: Solution) -> list[Findin
 
 
 def _halves(errors: SharedErrors, late: Bools) -> SharedErrors:
-    """Return the errors of a drive whose halves count as having different cameras. late: (K,) whether a keyframe is in the
-    second half."""
+    """Return the shared errors of a drive in which each camera is treated as two cameras, one for each half of the drive.
+    late: (K,) whether a keyframe is in the second half."""
     keyframes = replace(errors.keyframes, camera=errors.keyframes.camera + len(errors.log.cameras) * late)
     log = replace(errors.log, cameras=in_halves(errors.log.cameras))
     found = shared_errors(log, keyframes, errors.rays, errors.settings)

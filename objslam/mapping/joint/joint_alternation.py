@@ -146,9 +146,10 @@ class JointState:
     def alternated(self, map_T_base: Floats, guess: Guess | None) -> Self:
         """Return the state after association and solve in turns. map_T_base: (K, 4, 4) the first poses.
 
-        If an earlier association returns, a few rays could change for ever. Then the best `explained` state since that round
-        is returned. A few changed rays hardly change the shared errors, but to estimate these takes most of the time of a
-        solve. So the shared errors keep the values of the first round. After the last round, they are estimated again.
+        If a round finds the association of an earlier round again, a few rays could change back and forth without end. Then
+        the best `explained` state since that round is returned. A few changed rays hardly change the shared errors, but to
+        estimate these takes most of the time of a solve. So the shared errors keep the values of the first round. After the
+        last round, they are estimated again.
         """
         state, before, earlier, states = self, self, dict[bytes, Self](), [] if self.estimate is None else [self]
         held = False  # Whether the last solve held the shared errors.

@@ -9,8 +9,9 @@ _HALF = 0.5
 """The ratio between the shares of fitting rays in the two halves, worse to better, below which the halves differ. A larger
 value finds smaller differences."""
 _FEW, _PART = 2, 0.1
-"""The least number of an object's rays, and the least share of them, in a half that sees the object. With smaller values, a
-fit by chance counts as an object. About a tenth of the boxes of another recording fit an object of their label by chance."""
+"""A half sees an object if it has at least `_FEW` of the object's fitting rays, and at least the share `_PART` of them. With
+smaller values, a fit by chance counts as an object. About a tenth of the boxes of another recording fit an object of their
+label by chance."""
 
 
 def check_halves(late: Bools, fits: Bools) -> Finding | None:
