@@ -11,7 +11,7 @@ from objslam.mapping.doubts.find import mostly_doubtful
 from objslam.mapping.fixed.map_at_poses import MapAtPoses
 from objslam.mapping.localization import PriorMap
 from objslam.mapping.progress import Progress, stage
-from objslam.mapping.stages.described import mapped
+from objslam.mapping.stages.described import mapped, not_placed
 from objslam.mapping.stages.drive import Drive
 from objslam.mapping.stages.measurements import checked, measured
 from objslam.mapping.stages.result import in_known_map, result_of
@@ -106,8 +106,8 @@ def _run(
     if known is not None:
         with stage("localize", seconds, progress):
             of, where = in_known_map(of, known, ledger)
-        if where.solution is None and found.drive.joint:  # It stays in its own frame, as without an older map.
-            of = mapped(found, earlier, ledger, level=True)
+        if where.solution is None:
+            of = not_placed(of, found, earlier)
     result = result_of(of, where, frames, seconds, ledger, progress)
     return result, reason_to_solve(of, result), for_second_solve(of, result)
 

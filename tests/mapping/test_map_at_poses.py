@@ -38,7 +38,7 @@ def drive():
 
 
 def test_the_second_solve_does_not_search_at_the_poses_again(drive, monkeypatch):
-    begun = []
+    begun, stages = [], []
 
     def searched(*_):
         raise AssertionError("the objects at the poses were searched again")
@@ -46,8 +46,12 @@ def test_the_second_solve_does_not_search_at_the_poses_again(drive, monkeypatch)
     better = joint_solve._or_as_in_fixed_mode
     monkeypatch.setattr(joint_solve, "associate_at_poses", searched)
     monkeypatch.setattr(joint_solve, "_or_as_in_fixed_mode", lambda a, b: (begun.append(a.at_poses), better(a, b))[1])
-    result = pipeline.run(drive, load_settings(None, ("output.recording=false", "bodies.use=false")), Ledger())
+    settings = load_settings(None, ("output.recording=false", "bodies.use=false"))
+    result = pipeline.run(drive, settings, Ledger(), lambda stage, *_: stages.append(stage))
     assert result.summary["mode"] == "joint"
+    again = [stage.startswith("poses too, ") for stage in stages]
+    assert again == sorted(again)  # The lines of the second solve say that they are of it.
+    assert 0 < sum(again) < len(again)
     assert len(begun) >= 1
     assert all(one is not None and one.count >= 10 for one in begun)
     told = evaluate(result.map, drive.truth, None, align="none", radius=0.5).to_dict()

@@ -31,7 +31,7 @@ from objslam.mapping.joint.doubted_labels import doubted_names
 from objslam.mapping.joint.labels import labels_tell, may_be_by_label
 from objslam.mapping.localization import Localization, PriorMap
 from objslam.mapping.solution import Solution, without_errors
-from objslam.mapping.stages.described import DescribedDrive, mapped
+from objslam.mapping.stages.described import DescribedDrive, mapped, not_placed
 from objslam.mapping.stages.drive import Drive
 from objslam.mapping.stages.result import in_known_map, in_map
 from objslam.mapping.stages.solved import SolvedDrive, without_refuted_findings, without_solved_errors
@@ -59,8 +59,8 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
     of, where = _with_kept_ids(mapped(solved, None, ledger, level=known is None), found), None
     if known is not None:
         of, where = in_known_map(of, known, ledger)
-        if where.solution is None and solved.drive.joint:  # It stays in its own frame, as without a prior map.
-            of = _with_kept_ids(mapped(solved, None, ledger, level=True), found)
+        if where.solution is None:
+            of = _with_kept_ids(not_placed(of, solved, None), found)
     return _result(m, of, where, journal, round(time.perf_counter() - begin, 4))
 
 

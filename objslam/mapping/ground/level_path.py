@@ -13,7 +13,13 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.geometry import is_planar
 from objslam.core.rotation import quaternion_from_rotation, rotation_from_vector
+from objslam.core.types import Keyframes
 from objslam.mapping.solution import Solution
+
+
+def has_free_tilt(keyframes: Keyframes) -> bool:
+    """Return whether nothing measures how the first pose tilts: the poses are planar odometry, without a localisation."""
+    return not keyframes.localized_every and is_planar(keyframes.map_T_base)
 
 
 def levelled(solution: Solution) -> Solution:
@@ -23,7 +29,7 @@ def levelled(solution: Solution) -> Solution:
     measured poses say how the robot tilts. The solution then stays as it is.
     """
     keyframes, estimate = solution.keyframes, solution.estimate
-    if keyframes.localized_every or not is_planar(keyframes.map_T_base):
+    if not has_free_tilt(keyframes):
         return solution
     turn, origin = _to_level(estimate.map_T_base[:, :3, 2].mean(axis=0)), estimate.map_T_base[0, :3, 3]
 

@@ -19,7 +19,7 @@ from objslam.mapping.fixed.far_sides import with_far_sides
 from objslam.mapping.fixed.lasting_errors import check_lasting_noise, with_lasting_errors
 from objslam.mapping.fixed.lasting_noise import LastingNoise
 from objslam.mapping.fixed.map_at_poses import MapAtPoses
-from objslam.mapping.ground.level_path import levelled
+from objslam.mapping.ground.level_path import has_free_tilt, levelled
 from objslam.mapping.joint.path_against_localization import check_bent_path
 from objslam.mapping.moves.near_sides import check_rows
 from objslam.mapping.moves.phantoms import check_neighbours
@@ -55,6 +55,16 @@ def mapped(found: SolvedDrive, earlier: MapAtPoses | None, ledger: Ledger, *, le
     """
     complete, lasting = _completed(found, level=level)
     return _described(complete, lasting, earlier, ledger)
+
+
+def not_placed(of: DescribedDrive, found: SolvedDrive, earlier: MapAtPoses | None) -> DescribedDrive:
+    """Return the map of a drive that is in no older map. It is level, as without an older map.
+
+    of: the map before it was level, from `mapped`. Its warnings count. found, earlier: as in `mapped`.
+    """
+    if not found.drive.joint or not has_free_tilt(found.solution.keyframes):
+        return of
+    return mapped(found, earlier, Ledger(), level=True)
 
 
 def _completed(found: SolvedDrive, *, level: bool) -> tuple[SolvedDrive, LastingNoise | None]:
