@@ -11,9 +11,10 @@ from objslam.core.validity import rigid_poses, valid_pose_rows, valid_stamps
 
 
 def as_poses(values: ArrayLike) -> Floats:
-    """Return poses (N, 4, 4) from matrices (N, 4, 4), or from rows (N, 3) of x, y, yaw or (N, 7) of x, y, z, qx, qy, qz, qw.
+    """Return poses (N, 4, 4). values: matrices (N, 4, 4), or rows (N, 3) of x, y, yaw, or rows (N, 7) of x, y, z, qx, qy,
+    qz, qw.
 
-    Units are m and rad. ValueError for another shape, or if a pose is not finite and rigid.
+    Units are m and rad. ValueError for another shape, or if a pose is not finite, not rigid or too far away.
     """
     given = np.asarray(values, dtype=np.float64)
     if given.shape[1:] == (4, 4):
@@ -31,12 +32,14 @@ def as_poses(values: ArrayLike) -> Floats:
 
 
 def as_pose(values: ArrayLike) -> Floats:
-    """Return one pose (4, 4), given in any form that `as_poses` takes for a pose. ValueError if it is no valid pose."""
+    """Return one pose (4, 4). values: a matrix (4, 4), or a row (3,) or (7,) as for `as_poses`. ValueError if the values are
+    not a valid pose."""
     return as_poses(np.asarray(values, dtype=np.float64)[None])[0]
 
 
 def as_stamps(values: ArrayLike) -> Floats:
-    """Return stamps (N,), s. ValueError if they are not (N,), not finite, or do not increase."""
+    """Return the stamps (N,), s, as an array. ValueError if the shape is not (N,), or if the stamps are not finite or do not
+    increase."""
     stamps = np.asarray(values, dtype=np.float64)
     if stamps.ndim != 1:
         raise ValueError(f"stamps are (N,) seconds, got the shape {stamps.shape}")
@@ -46,7 +49,8 @@ def as_stamps(values: ArrayLike) -> Floats:
 
 
 def as_boxes(values: ArrayLike, where: str) -> Floats:
-    """Return the boxes (B, 4) of one frame, px. An empty list gives (0, 4). ValueError, with `where`, if not (B, 4)."""
+    """Return the boxes (B, 4) of one frame: x1, y1, x2, y2 in px. An empty list gives (0, 4). where: the name of the frame
+    for messages. ValueError for another shape."""
     given = np.asarray(values, dtype=np.float64)
     if given.size and given.shape[1:] != (4,):
         raise ValueError(f"{where}: boxes are (B, 4) x1, y1, x2, y2, got the shape {given.shape}")
@@ -54,10 +58,11 @@ def as_boxes(values: ArrayLike, where: str) -> Floats:
 
 
 def per_box(values: Sequence[ArrayLike] | None, counts: Sequence[int], unknown: float, name: str) -> Floats:
-    """Return the numbers (M,) of all M boxes. values: one list for each frame, with one number for each of its boxes.
+    """Return the numbers (M,), one for each of the M boxes of all frames. values: one list for each frame, with one number
+    for each of its boxes. Without `values`, each number is `unknown`.
 
-    Without `values`, each number is `unknown`. counts: the number of boxes of each frame. ValueError, with `name`, if the
-    lists have other lengths.
+    counts: the number of boxes of each frame. name: the name of `values` for messages. ValueError if the lengths of the
+    lists differ from `counts`.
     """
     if values is None:
         return np.full(sum(counts), unknown)

@@ -1,4 +1,4 @@
-"""The camera of a user: a calibration that is checked when it is made. Its base class is in `core.camera`."""
+"""The camera class for users. It checks the calibration of each new camera. Its base class is in `core.camera`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from objslam.core import camera
 from objslam.core.validity import camera_fault
 
 _OUTSIDE = 10.0
-"""How far outside the image a principal point may be, as a multiple of the image's size. If the image is a small part cut
-out of another image, its principal point is outside by a few sizes. A larger multiple accepts more wrong numbers."""
+"""The largest distance of a principal point from the image, as a multiple of the image size. If the image is a small part
+cut out of another image, its principal point is outside by a few image sizes. With a larger multiple, more wrong numbers are
+accepted."""
 
 
 @dataclass(frozen=True)
@@ -20,17 +21,17 @@ class Camera(camera.Camera):
     """A calibrated camera with the fields of ROS camera_info, and its pose on the robot.
 
     Args:
-        name: of the camera.
-        width, height: of the image, px.
-        matrix: (3, 3) px, with the rows fx 0 cx, 0 fy cy, 0 0 1.
+        name: the name of the camera.
+        width, height: the size of the image, px.
+        matrix: (3, 3) the camera matrix, px. Its rows are fx 0 cx, 0 fy cy, 0 0 1.
         distortion_model: plumb_bob, rational_polynomial or equidistant.
-        distortion: its coefficients, no distortion by default.
-        base_T_camera: (4, 4) the pose of the optical frame (z ahead, x right, y down) in base.
+        distortion: (D,) the coefficients of the model. The default is no distortion.
+        base_T_camera: (4, 4) the pose of the optical frame (z ahead, x right, y down) in base, m.
         depth_scale: the units of a depth image per metre.
         sees_size: whether the boxes show how large the objects are.
-        depth_noise: the noise of its depths, None for the noise in the settings.
+        depth_noise: the noise of the camera's depths. None: the noise in the settings `depth`.
     Raises:
-        ValueError: no camera has such a calibration. The message names the fault.
+        ValueError: the calibration is not valid. The message names the fault.
     """
 
     def __post_init__(self) -> None:
@@ -48,14 +49,15 @@ class Camera(camera.Camera):
 
 
 def as_camera(given: camera.Camera) -> Camera:
-    """Return a camera whose calibration is checked. ValueError names what is wrong with it."""
+    """Return the camera with a checked calibration. ValueError names the fault."""
     if isinstance(given, Camera):
         return given
     return Camera(**{name: getattr(given, name) for name in camera.Camera.__dataclass_fields__})
 
 
 def checked_arrays(given: camera.Camera) -> dict[str, Any]:
-    """Return the matrix, the distortion and base_T_camera as arrays. ValueError names an array of a wrong shape."""
+    """Return the fields matrix, distortion and base_T_camera as arrays, by name. ValueError names a field of a wrong
+    shape."""
     found = {name: np.asarray(getattr(given, name), dtype=np.float64) for name in ("matrix", "distortion", "base_T_camera")}
     for name, shape in (("matrix", (3, 3)), ("base_T_camera", (4, 4))):
         if found[name].shape != shape:

@@ -1,4 +1,5 @@
-"""The data of a user: logs, detections and trajectories made from arrays. Their base classes are in `core.types`."""
+"""The data classes for users: logs, detections and trajectories that are made from arrays. Their base classes are in
+`core.types` and `core.trajectory`."""
 
 from __future__ import annotations
 
@@ -23,18 +24,19 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-_COLUMNS = ("stamp", "x", "y", "z", "qx", "qy", "qz", "qw")  # The columns of a table of poses, s and m.
+_COLUMNS = ("stamp", "x", "y", "z", "qx", "qy", "qz", "qw")  # The columns of a table of poses, in s and m.
 
 
 class Trajectory(trajectory.Trajectory):
-    """Poses of one coordinate frame in another over time. stamps: (N,) s, increasing. poses: (N, 4, 4)."""
+    """Poses of one coordinate frame in another over time. stamps: (N,) s, increasing. poses: (N, 4, 4), with positions in
+    m."""
 
     @classmethod
     def from_arrays(cls, stamps: ArrayLike, poses: ArrayLike) -> Self:
-        """Make a trajectory from stamps (N,), s, and poses.
+        """Return a trajectory from stamps (N,), s, and poses.
 
-        poses: matrices (N, 4, 4), or rows (N, 3) of x, y, yaw or (N, 7) of x, y, z, qx, qy, qz, qw, in m and rad. ValueError
-        names a wrong row.
+        poses: matrices (N, 4, 4), or rows (N, 3) of x, y, yaw, or rows (N, 7) of x, y, z, qx, qy, qz, qw, in m and rad.
+        ValueError names the first wrong row.
         """
         times, rows = as_stamps(stamps), as_poses(poses)
         if len(times) != len(rows):
@@ -42,7 +44,7 @@ class Trajectory(trajectory.Trajectory):
         return cls(times, rows)
 
     def to_arrow(self) -> pa.Table:
-        """Return a pyarrow table with the columns stamp, x, y, z, qx, qy, qz, qw."""
+        """Return the poses as a pyarrow table with the columns stamp (s), x, y, z (m), qx, qy, qz, qw."""
         turns = quaternion(self.poses) if len(self) else np.zeros((0, 4))
         values = np.column_stack([self.stamps, self.poses[:, :3, 3], turns])
         return arrow_table(dict(zip(_COLUMNS, values.T.copy(), strict=True)))
@@ -74,13 +76,14 @@ class Detections(types.Detections):
         features: Sequence[ArrayLike] | None = None,
         whole: bool = False,
     ) -> Self:
-        """Make detections from one list for each of F frames. A frame without a box has empty lists.
+        """Return the detections of one camera. Each argument except `whole` has one entry for each of the F frames. A frame
+        without a box has empty lists.
 
-        stamps: (F,) s. boxes: for each frame (B, 4) x1, y1, x2, y2 in px of the raw image. labels: for each frame B names
-        or integers. scores: for each frame (B,) in [0, 1], 1 by default. depths: for each frame (B,) z in m, NaN where
-        unknown. track_ids: for each frame B integers, -1 where unknown. features: for each frame (B, D) appearance vectors,
-        such as the embeddings of a network. D is at least 1. An unknown vector is a row of NaN. whole: True if boxes are not
-        cut off at the image's edge. ValueError names what is wrong.
+        stamps: (F,) s. boxes: for each frame (B, 4) x1, y1, x2, y2 in px of the raw image. labels: for each frame B names or
+        integers. scores: for each frame (B,) in [0, 1], 1 by default. depths: for each frame (B,) z along the optical axis
+        in m, NaN if unknown. track_ids: for each frame B integers, -1 if unknown. features: for each frame (B, D) appearance
+        vectors, such as the embeddings of a network. D is at least 1. An unknown vector is a row of NaN. whole: whether the
+        image's edge cuts off no box. ValueError names the wrong frame or argument.
         """
         frames = [as_boxes(one, f"frame {k}") for k, one in enumerate(boxes)]
         counts = [len(one) for one in frames]
@@ -125,10 +128,11 @@ class Log(types.Log):
         localization: tuple[ArrayLike, ArrayLike] | trajectory.Trajectory | None = None,
         name: str = "log",
     ) -> Self:
-        """Make a log from arrays. A path is a `Trajectory`, or the stamps and poses of `Trajectory.from_arrays`.
+        """Return a log from cameras, detections and paths.
 
-        cameras, detections: a camera and its detections, or sequences of equal length. odometry: odom_T_base. localization:
-        map_T_base. A log needs at least one of these two paths. ValueError names what is wrong.
+        cameras, detections: one camera and its detections, or two sequences of equal length. odometry: the poses
+        odom_T_base. localization: the poses map_T_base. A log needs odometry, a localisation or both. Each is a
+        `Trajectory`, or a pair of stamps and poses as for `Trajectory.from_arrays`. ValueError names what is wrong.
         """
         lenses = [as_camera(one) for one in ([cameras] if isinstance(cameras, Camera) else cameras)]
         boxes = [detections] if isinstance(detections, types.Detections) else list(detections)
@@ -143,7 +147,8 @@ class Log(types.Log):
         return cls(name, views, _path(odometry, "odometry"), _path(localization, "localization"))
 
     def with_detections(self, detections: types.Detections | Mapping[str, types.Detections]) -> Self:
-        """Return the log with other boxes: the detections of its only camera, or the detections of each camera by name.
+        """Return the log with the given detections in place of its own. detections: those of the only camera of the log, or
+        a mapping from camera names to detections.
 
         ValueError if the given names differ from the names of the cameras.
         """
@@ -163,14 +168,16 @@ class Log(types.Log):
 
 
 def _name(label: str | int) -> str:
-    """Return the name of a label, which may be an integer, as in detections.jsonl. Anything else stays as it is."""
+    """Return a label as text. An integer becomes its digits, as in detections.jsonl. Any other value is returned
+    unchanged."""
     return str(int(label)) if isinstance(label, (int, np.integer)) and not isinstance(label, bool) else label  # type: ignore[return-value]
 
 
 def _unit_features(features: Sequence[ArrayLike], counts: list[int]) -> Floats32:
-    """Return the unit appearance vectors (M, D) of all boxes, NaN where unknown. ValueError names a wrong frame.
+    """Return the unit appearance vectors (M, D) of all M boxes. The row of a box without a vector is NaN. ValueError names
+    the wrong frame.
 
-    counts: the number of boxes of each frame.
+    features: for each frame (B, D) the vectors of its boxes. counts: the number of boxes of each frame.
     """
     if len(features) != len(counts):
         raise ValueError(f"features needs one list for each frame, got {len(features)} for {len(counts)}")

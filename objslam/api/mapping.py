@@ -1,4 +1,4 @@
-"""Read a recording and map it, in one call each."""
+"""The functions that read a recording (`read`) and map it (`run`)."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ if TYPE_CHECKING:
     from objslam.mapping.localization import PriorMap
 
 Given = Settings | Mapping[str, Any] | str | PathLike[str] | None
-"""Settings as a user gives them: `Settings`, a mapping of changes of the defaults, the name of ready settings, a YAML file,
+"""The settings that a user gives: `Settings`, a mapping of changes to the defaults, the name of ready settings, a YAML file,
 or None for the defaults."""
 
 _LOG = logging.getLogger("objslam")
 
 
 def read(path: str | PathLike[str], **options: Any) -> Log:
-    """Read a log folder, a ROS bag, or another recording that `objslam info` knows.
+    """Return the log of a recording. path: a log folder, a ROS bag, or another recording that `objslam info` knows.
 
-    options: the options for this kind of recording, named like their flags: `robot=1` for --robot 1, `label="cup"` for
-    --label cup. `objslam.sources.SourceOptions` lists them. Dropped data are logged as warnings and counted in the log's
-    `reading`. LogError if the recording cannot be read, ConfigError for a wrong option.
+    options: the options for this kind of recording. Their names are those of the flags: `robot=1` is --robot 1, and
+    `label="cup"` is --label cup. `objslam.sources.SourceOptions` lists them. Dropped data are logged as warnings. They are
+    also counted in the log's `reading`. LogError if the recording cannot be read, ConfigError for a wrong option.
     """
     known = [field.name for field in fields(SourceOptions)]
     if unknown := [name for name in options if name not in known]:
@@ -60,22 +60,23 @@ def run(
     progress: Progress = lambda stage, done, total: None,
     **changes: Any,
 ) -> Result:
-    """Map the objects of a log.
+    """Map the objects of a log, and return the result.
 
     Args:
         log: what `read` or `Log.from_arrays` returned. It is not changed.
-        settings: a `Settings`, changes of the defaults such as {"mode": "joint", "rays.pixel_sigma": 2}, a YAML file, or the
-            name of ready settings such as "odometry".
-        detector: an ONNX model that finds the boxes in the log's images. They replace the boxes of the log.
-        embed: an ONNX image encoder that makes an appearance vector of each box, from the log's images.
-        map: the map of another day, as a `Result`, an `ObjectMap`, or its file or result folder. If the drive is found in
-            this map, the result is in the frame of the map, and the objects of the map count as priors. `Result.localised`
-            says whether it was found.
-        progress: a function that gets the stage's name, the work done, and the total work, 0 if the total is unknown.
-        changes: more changes, which override `settings`: `mode="joint"`, `rays={"pixel_sigma": 2}`.
+        settings: a `Settings`, a mapping of changes to the defaults such as {"mode": "joint", "rays.pixel_sigma": 2}, a
+            YAML file, or the name of ready settings such as "odometry".
+        detector: the path of an ONNX model that finds boxes in the log's images. These boxes replace the boxes of the
+            log.
+        embed: the path of an ONNX image encoder. It makes an appearance vector of each box from the log's images.
+        map: the map of another day, as a `Result`, an `ObjectMap`, or the path of its file or result folder. If the
+            drive is found in this map, the result is in the frame of the map, and the objects of the map count as priors.
+            `Result.localised` says whether the drive was found.
+        progress: a function of the stage's name, the steps done, and the total number of steps (0 if unknown).
+        changes: more changes of settings, such as `mode="joint"` or `rays={"pixel_sigma": 2}`. They override `settings`.
     Raises:
         LogError: no frame lies on the path. SolveError: no box gives a usable ray. ConfigError: a setting is wrong.
-        DetectorError: the model cannot be used. OutputError: `map` cannot be read. TypeError: `log` is no log.
+        DetectorError: the model cannot be used. OutputError: `map` cannot be read. TypeError: `log` is not a log.
     """
     if not isinstance(log, types.Log):
         raise TypeError(f"run needs a log, as `objslam.read(path)` returns it, got {type(log).__name__}")
@@ -91,8 +92,8 @@ def run(
 
 
 def prior_map(given: Result | ObjectMap | str | PathLike[str]) -> PriorMap:
-    """Return the map of another day, from a `Result`, an `ObjectMap`, a file or a result folder. OutputError if it cannot be
-    read."""
+    """Return the map of another day. given: a `Result`, an `ObjectMap`, or the path of a file or a result folder.
+    OutputError if the map cannot be read."""
     from objslam.mapping.localization import PriorMap
 
     if isinstance(given, Result):
@@ -111,9 +112,11 @@ def map_log(
     known: PriorMap | None = None,
     encoder: Path | None = None,
 ) -> tuple[RunResult, types.Log]:
-    """Return the result of a run, and the log. A `detector` replaces the boxes of this log.
+    """Map a log. Return the result of the run, and the log with the boxes and vectors that were used.
 
-    known: the map of another day, in which the drive is searched for. encoder: gives the boxes their appearance vectors.
+    detector: the path of a detection model, whose boxes replace the boxes of the log, or None. encoder: the path of an image
+    encoder, which gives each box its appearance vector, or None. known: the map of another day, in which the drive is
+    searched for, or None.
     """
     from objslam.mapping import pipeline
 

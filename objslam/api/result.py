@@ -21,7 +21,8 @@ from objslam.mapping.checks.assessment import Assessment
 
 @dataclass(frozen=True)
 class _Run:
-    """The data for writing a result folder. detected: whether a detector found the boxes of the log."""
+    """The data from which `Result.save` writes a result folder. detected: whether this run made boxes or appearance vectors.
+    If so, the folder contains all boxes."""
 
     result: RunResult
     log: types.Log | None
@@ -32,9 +33,9 @@ class _Run:
 class Result:
     """The result of a run.
 
-    objects: the map. poses: map_T_base at each camera frame that had a usable box. path: map_T_base at the full rate of the
-    log. rays: all rays, with their objects and residuals. summary: the content of summary.json. folder: where the result
-    was loaded from, None for a result from memory.
+    objects: the map. poses: the poses map_T_base, m, at each camera frame that had a usable box. path: the poses map_T_base
+    at the full rate of the log. rays: all rays, with their objects and residuals. summary: the content of summary.json.
+    folder: the folder from which the result was loaded, None for a result from memory.
     """
 
     objects: ObjectMap
@@ -47,7 +48,8 @@ class Result:
 
     @classmethod
     def of(cls, result: RunResult, log: types.Log | None = None, *, detected: bool = False) -> Self:
-        """Return the result of a mapping. log: the log that it mapped. detected: whether a detector found its boxes."""
+        """Return the result of a mapping as a `Result`. log: the log that was mapped. detected: whether this run made the
+        boxes of the log, or their appearance vectors."""
         from objslam.output.result_folder import rays_table
 
         stamps, first = np.unique(result.keyframes.stamps, return_index=True)
@@ -77,7 +79,8 @@ class Result:
         )
 
     def save(self, folder: str | PathLike[str]) -> tuple[str, ...]:
-        """Write the result folder as `objslam run` does, in the place of an older result. A loaded result is copied.
+        """Write the result folder as `objslam run` does, and replace an older result in it. For a loaded result, copy its
+        files.
 
         Return the names of the older result's files that were deleted and not replaced. OutputError if the folder cannot be
         written, or if it holds a log or files that no run wrote.
@@ -94,7 +97,8 @@ class Result:
 
     @property
     def assessment(self) -> Assessment:
-        """Whether the result can be used, with the reasons. OutputError for a result of an older version."""
+        """The assessment of the result: whether the map can be used, and the reasons. OutputError for a result of an older
+        version."""
         found = self.summary.get("assessment")
         if found is None:
             raise OutputError("this result is from an older version, without an assessment", hint="run again")
@@ -102,7 +106,7 @@ class Result:
 
     @property
     def views(self) -> Views | None:
-        """Where each image was taken. None for a live session, or a result of an older version."""
+        """The camera poses at which the images were taken. None for a live session, or for a result of an older version."""
         from objslam.io.results import read
 
         if self._run is None:
@@ -113,7 +117,7 @@ class Result:
 
     @property
     def doubts(self) -> tuple[Doubt, ...]:
-        """What is doubtful in the map, in words and numbers. Empty for a result of an older version."""
+        """The doubts about the map, in words and numbers. Empty for a result of an older version."""
         from objslam.io.results import read
 
         if self._run is not None:
@@ -122,17 +126,17 @@ class Result:
 
     @property
     def localised(self) -> bool:
-        """Whether the drive was found in the map of another day, so that the result is in the frame of that map."""
+        """Whether the drive was found in the map of another day. If so, the result is in the frame of that map."""
         return bool(self.summary.get("localisation", {}).get("localised", False))
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The warnings of the run, one line each, as the terminal shows them. Dropped data come first."""
+        """The warnings of the run as the terminal shows them, one line each. Warnings about dropped data come first."""
         return tuple(self.summary.get("warnings", ()))
 
     @property
     def dropped(self) -> dict[str, int]:
-        """The numbers of dropped data by reason."""
+        """The number of dropped data for each reason."""
         return dict(self.summary.get("dropped", {}))
 
     def __repr__(self) -> str:

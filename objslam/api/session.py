@@ -1,4 +1,4 @@
-"""A session for programs that push live data into it, without any middleware."""
+"""A session for programs that push live data into a map. It needs no middleware."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from objslam.live.session.session import Session as LiveSession
 
 
 class Session(LiveSession):
-    """A map that grows while data are pushed, in a thread of its own.
+    """A map that grows while data are pushed. The session maps in a thread of its own.
 
     A `with` block starts and ends the session. Push cameras first, then poses and boxes, from any thread. A push returns
-    False if the message is dropped. `snapshot().dropped` counts the reasons. `result` ends the session and solves the whole
-    map once more.
+    False if the message is dropped. `snapshot().dropped` counts the dropped messages by reason. `result` ends the session
+    and solves the whole map once more.
 
         with objslam.Session() as session:
             session.push_camera(camera)
@@ -33,12 +33,12 @@ class Session(LiveSession):
             print(session.snapshot().map)
             result = session.result()
 
-    settings, changes: as in `objslam.run`. The mode is always joint. journal: a file that keeps every accepted message, so
-    that a killed program loses nothing. resume: whether to continue an existing journal. name: the name of the log in the
-    result. patient: for data that do not come from a running robot. A push then waits while the session has too much to do,
-    and the session waits for calibrations, so that nothing is dropped for lack of time. Push in the order of the stamps.
-    map: the map of another day, as a `Result`, an `ObjectMap`, or its file or result folder. Once the session is found in
-    this map, `snapshot().in_map` says so, and snapshots and result are in the frame of the map.
+    settings, changes: as in `objslam.run`. The mode is always joint. journal: the path of a file that stores every accepted
+    message, so that a program that is killed loses nothing. resume: whether to continue an existing journal. name: the name
+    of the log in the result. patient: use True for data that do not come from a running robot. A push then waits while the
+    session is busy, and the session waits for calibrations. So nothing is dropped for lack of time. Push in the order of the
+    stamps. map: the map of another day, as a `Result`, an `ObjectMap`, or the path of its file or result folder. Once the
+    session is found in this map, `snapshot().in_map` says so. Snapshots and result are then in the frame of the map.
     """
 
     def __init__(
@@ -63,32 +63,34 @@ class Session(LiveSession):
         self.abort()
 
     def push_odometry(self, stamp: float, odom_T_base: ArrayLike, covariance: Floats | None = None) -> bool:
-        """Push odom_T_base at a stamp, s. It is a matrix (4, 4), or three numbers x, y, yaw, or seven numbers x, y, z, qx,
-        qy, qz, qw, in m and rad. The covariance has no effect: the drift comes from the settings."""
+        """Push the pose odom_T_base of the odometry at a stamp, s. The pose is a matrix (4, 4), or three numbers x, y, yaw,
+        or seven numbers x, y, z, qx, qy, qz, qw, in m and rad. `covariance` has no effect, because the settings give the
+        drift. Return False if the pose is dropped."""
         return super().push_odometry(stamp, _pose(odom_T_base), covariance)
 
     def push_localization(self, stamp: float, map_T_base: ArrayLike, covariance: Floats | None = None) -> bool:
-        """Push map_T_base of a localisation at a stamp, s. The pose has one of the forms of `push_odometry`."""
+        """Push the pose map_T_base of a localisation at a stamp, s. The pose has one of the forms of `push_odometry`."""
         return super().push_localization(stamp, _pose(map_T_base), covariance)
 
     def push_mount(self, stamp: float, camera: str, base_T_camera: ArrayLike) -> bool:
-        """Push base_T_camera of a camera that moves on the robot. It is valid from the stamp, s, until the next one.
+        """Push the pose base_T_camera of a camera that moves on the robot. It is valid from the stamp, s, until the next
+        such pose.
 
         The pose has one of the forms of `push_odometry`.
         """
         return super().push_mount(stamp, camera, _pose(base_T_camera))
 
     def snapshot(self) -> Snapshot:
-        """Return the present map, path and counts, usually in milliseconds. If the session has stopped, or is busy for 5 s,
-        return its last snapshot."""
+        """Return the present map, path and counts. This usually takes milliseconds. If the session has stopped, or is busy
+        for 5 s, return its last snapshot."""
         found = super().snapshot()
         return replace(found, map=ObjectMap.of(found.map))
 
     def result(self) -> Result:
         """End the session, solve the whole map once more, and return the result. SolveError if no box could be mapped.
 
-        A frame is not mapped if a much newer pose was pushed before it. The summary has a warning with the number of such
-        frames.
+        A frame is not mapped if it is more than live.max_late older than the newest pose. In a patient session, the summary
+        then has a warning with the number of such frames.
         """
         late = self.counters.dropped().get(LATE_FRAME, 0)
         if self._patient and late:
@@ -98,7 +100,8 @@ class Session(LiveSession):
 
 
 def _pose(values: ArrayLike) -> Any:
-    """Return a pose (4, 4). Values that are no pose are returned unchanged, and the session refuses and counts them."""
+    """Return a pose (4, 4). If the values are not a pose, return them unchanged. The session then refuses and counts
+    them."""
     try:
         return as_pose(values)
     except (TypeError, ValueError):

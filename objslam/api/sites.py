@@ -24,11 +24,11 @@ Given = Result | object_map.ObjectMap | str | PathLike[str]
 
 
 def merge(sessions: Sequence[Given]) -> tuple[Island, ...]:
-    """Join the maps of several sessions, each in a frame of its own, to one map of the site.
+    """Join the maps of several sessions to one map of the site. The map of each session has a frame of its own.
 
-    sessions: in the order of time. Return one island for each group of sessions that share objects, the largest first.
-    `Island.objects` is its map, in the frame of its first session, and `MapObject.life` says what became of each object.
-    ValueError without a session, and for one path alone. OutputError if a path cannot be read.
+    sessions: the sessions in the order of time. Return one island for each group of sessions that share objects. The largest
+    island comes first. `Island.objects` is its map, in the frame of its first session. `MapObject.life` says what became of
+    each object. ValueError if there is no session, or if `sessions` is one path. OutputError if a path cannot be read.
     """
     if isinstance(sessions, (str, PathLike)):
         raise ValueError(f"merge needs a sequence of sessions, got the one path {str(sessions)!r}")
@@ -39,32 +39,34 @@ def merge(sessions: Sequence[Given]) -> tuple[Island, ...]:
 
 
 def diff(a: Given, b: Given) -> Comparison:
-    """Compare a map with the map of a later session: which objects are confirmed, moved, gone, new or unconfirmed.
+    """Compare a map with the map of a later session. Return which objects are confirmed, moved, gone, new or unconfirmed.
 
-    The later session should be the result of a run. A map alone does not say what was in view, and the result of a live
-    session does not say it either. Then no object counts as gone or moved (`Comparison.has_views`). If the registration is
-    refused, there are no changes, and `reason` says why. OutputError if a path cannot be read.
+    The later session should be the result of an offline run. A map alone and the result of a live session do not say what
+    was in view. With such a later session, no object counts as gone or moved (`Comparison.has_views`). If the registration
+    of the maps is refused, `changes` is empty, and `reason` says why. OutputError if a path cannot be read.
     """
     return compare(_session(a, "the first map"), _session(b, "the other map"))
 
 
 def register(a: Given, b: Given) -> Registration:
-    """Find the transform b_T_a from the frame of map a to the frame of map b, from the relative positions of their objects.
+    """Return the transform b_T_a from the frame of map a to the frame of map b, with its evidence. The relative positions of
+    the objects give the transform.
 
-    Both frames have z up. The transform turns about z and shifts along x, y and z, m. Only resolved objects count. `matches`
-    are indices into the objects of a and b. Use the transform only if `accepted` is true. OutputError if a path cannot be
-    read.
+    Both frames have z up. The transform turns about z and shifts along x, y and z, m. Only resolved objects are used.
+    `matches` has indices into the objects of a and b. Use the transform only if `accepted` is true. OutputError if a path
+    cannot be read.
     """
     return object_maps.register(_objects(a), _objects(b))
 
 
 def load_session(path: Path) -> Session:
-    """Load one session. OutputError names what is missing or damaged."""
+    """Return the session of a result folder, a site or an objects.json. OutputError names what is missing or damaged."""
     return Session.load(path)
 
 
 def warnings_of(sessions: Sequence[Session], islands: Sequence[Island]) -> list[str]:
-    """Return the warnings of a merge: sessions that stay apart, and results of runs that were localised in a map."""
+    """Return the warnings of a merge. They name sessions that share no objects with others, maps whose z axis does not point
+    up, and results that contain the objects of another map."""
     found = []
     if len(islands) > 1:
         apart = "; ".join(", ".join(sessions[s].name for s in one.sessions) for one in islands)

@@ -1,4 +1,4 @@
-"""The command line, with one file per command. Heavy imports are inside the commands, so that --help is fast."""
+"""The command line, with one file per command. Heavy modules are imported inside the commands, so that --help is fast."""
 
 import atexit
 import gc
@@ -7,17 +7,17 @@ import sys
 from typing import NoReturn
 
 _YOUNG = 400_000
-"""The number of new objects after which Python searches them for garbage in cycles. A run of a small log makes 223,000
-objects that stay, most of them in imports. One search of 200,000 objects takes 0.11 s, a tenth of the CPU of such a run, and
-found 6,000 to free. A larger number leaves garbage in memory for longer."""
+"""The number of new Python objects after which Python searches for garbage among them. A larger number leaves garbage in
+memory for longer. A run of a small log makes 223,000 objects that stay, most of them in imports. One search of 200,000
+objects took 0.11 s, a tenth of the CPU time of such a run, and found only 6,000 objects to free."""
 
 _BLAS_THREADS = "1"
-"""The number of threads of OpenBLAS, which multiplies the matrices of numpy and scipy, unless the user sets it. The matrices
-of a map are small. With more threads, they wait for each other in loops that keep the cores busy: on two cores, 30 minutes
-of a real robot took 8.1 s with two threads and 5.2 s with one."""
+"""The number of threads of OpenBLAS, unless the user sets another. OpenBLAS multiplies the matrices of numpy and scipy. The
+matrices of a map are small. More threads wait for each other in loops that keep the cores busy. On two cores, the log of 30
+minutes of a real robot took 8.1 s with two threads, and 5.2 s with one."""
 
 _MEANT = {"--mount": "the pose of a camera: --camera-info FILE with base_T_camera in it"}
-"""Options that newcomers try, and what does the same."""
+"""The options that newcomers try but that do not exist, each with an option that does the same."""
 
 
 def main() -> NoReturn:
@@ -29,12 +29,12 @@ def main() -> NoReturn:
     from objslam.errors import ObjslamError, is_out_of_memory, one_line
 
     atexit.register(gc.freeze)  # At its exit, Python would search all objects once more, which takes 0.08 s after a run.
-    if "OMP_NUM_THREADS" not in os.environ:  # It holds for OpenBLAS too.
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", _BLAS_THREADS)  # Before the imports: numpy starts the threads.
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # Damaged images are counted, and OpenCV need not print them.
-    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")  # It would search all installed packages for plugins.
+    if "OMP_NUM_THREADS" not in os.environ:  # This variable also sets the threads of OpenBLAS.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", _BLAS_THREADS)  # Before numpy is imported, which starts the threads.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # Damaged images are counted, so OpenCV need not print them.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")  # Pydantic would search all installed packages for plugins.
     debug = "--debug" in sys.argv
-    if sys.argv[1:2] == ["help"]:  # `objslam help run` is what many tools take.
+    if sys.argv[1:2] == ["help"]:  # `objslam help COMMAND` does the same as `objslam COMMAND --help`.
         sys.argv[1:] = [*sys.argv[2:], "--help"]
     for word in sys.argv[2:]:
         if (flag := word.partition("=")[0]) in _MEANT:

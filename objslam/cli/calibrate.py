@@ -25,7 +25,11 @@ def calibrate(
     out: Annotated[Path, typer.Option("-o", "--out", help="The calibration file to write.")] = Path("calibration.yaml"),
     mode: Annotated[
         Literal["fixed", "joint"] | None,
-        typer.Option("--mode", help="joint (the default): odometry and cameras. fixed: cameras against a localisation."),
+        typer.Option(
+            "--mode",
+            help="joint (the default): calibrate odometry and cameras. fixed: calibrate cameras at the poses of a "
+            "localisation.",
+        ),
     ] = None,
     config: Config = None,
     set_: Set = None,
@@ -35,7 +39,7 @@ def calibrate(
 ) -> None:
     """Estimate the errors that all measurements of a robot share, for `objslam run --calibration FILE`.
 
-    A log that cannot be used is left out with a warning.
+    If there are several logs, a log that cannot be used is left out with a warning.
     """
     from objslam.cli.run import calibration_table
     from objslam.core.calibration import combine
@@ -64,7 +68,8 @@ def calibrate(
         report(ledger)
     if not found:
         raise LogError(f"none of the {len(logs)} logs can be used", hint="the warnings say why")
-    if settings.calibration.file is not None:  # The prior of all logs. The result also has errors that only the file has.
+    # The file is the prior of all logs. Errors that only the file has are also in the result.
+    if settings.calibration.file is not None:
         known = load_calibration(Path(settings.calibration.file)).of_robot()
         found.insert(0, replace(known, prior=known.sigma, prior_mean=known.values, prior_covariance=known.covariance))
     together = combine(found)
@@ -76,8 +81,8 @@ def calibrate(
 
 
 def _calibrate(path: Path, options: SourceOptions, settings: Settings, ledger: Ledger, show: Progress) -> Calibration:
-    """Return the shared errors of one log. ConfigError if the log lacks the poses that the settings need. SolveError if the
-    estimation fails."""
+    """Return the shared errors in one log. Raises ConfigError if the log lacks the poses that the settings need, and
+    SolveError if the estimation fails."""
     from objslam.errors import ConfigError, SolveError
     from objslam.mapping import pipeline
     from objslam.sources import read
@@ -93,7 +98,7 @@ def _calibrate(path: Path, options: SourceOptions, settings: Settings, ledger: L
 
 
 def _of_several(show: Progress, number: int, total: int) -> Progress:
-    """Return a progress function that also names the present log, if there are several."""
+    """Return a progress function that also names the current log, if there are several logs."""
     prefix = f"log {number} of {total}: " if total > 1 else ""
     show(f"{prefix}reading", 0, 0)
     return lambda stage, done, count: show(f"{prefix}{stage}", done, count)

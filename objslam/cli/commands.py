@@ -28,15 +28,15 @@ COMMANDS: Final = {
     "config": "config:config_app",
     "journal": "journal:journal_app",
 }
-"""The commands in the order of --help, each with its file in this folder and its function there. A group of commands is an
-application of typer."""
+"""The commands in the order of --help. The value is "file:function", with a file in this folder. The function of a group of
+commands is an application of typer."""
 
 
 def build_app(words: list[str] | None = None) -> typer.Typer:
-    """Make the application of all commands, or of the one command that these words of the command line begin with.
+    """Return the application. If the words of the command line begin with a command, the application has only this command.
 
-    A process runs one command. The other commands, with their options, take about 3 % of the CPU of a small run. Words that
-    begin with no command, such as --help, need all commands.
+    A process runs only one command. The other commands, with their options, would take about 3 % of the CPU time of a small
+    run. If the words do not begin with a command, as with --help, the application has all commands.
     """
     words = [] if words is None else words[words[:1] == ["--debug"] :]
     only = words[0] if words and words[0] in COMMANDS else None

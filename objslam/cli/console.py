@@ -22,21 +22,22 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 
-_NEIGHBOURS = 3  # The most names of other files in a warning. A larger number makes the line longer.
+_NEIGHBOURS = 3  # The largest number of other files that a warning names. A larger number makes the line longer.
 Show = Callable[[str, int, int], None]
-"""A function of the stage's name, the number of finished items, and the total number of items, 0 if unknown."""
+"""A function that takes the name of a stage, the number of finished items, and the number of all items (0 if unknown)."""
 
 _EVERY = 10.0
-"""The time (s) between two looks at a running command, and before the first look. Each look prints new warnings and, if
-stderr is not a terminal, a line of progress. A larger value prints fewer lines. `objslam live` prints its status line as
-often. A command of a few seconds prints no progress, and one that fails at once prints one line."""
+"""The time from the start of a command to its first report, and from one report to the next, s. A report prints the new
+warnings. If stderr is not a terminal, it also prints a line of progress. A larger value prints fewer lines. `objslam live`
+prints its status line at the same interval. A command of a few seconds prints no progress. A command that fails at once
+prints one line."""
 
 
 @dataclass
 class SpeakingLedger(Ledger):
-    """A ledger that can print its warnings while a command works. So a user need not wait for the end of a run to hear that
-    the input is wrong. A run that starts again, with poses that are solved too, may take a warning back. told: the warnings
-    that are printed already."""
+    """A ledger that can print its warnings while a command works. A user need not wait for the end of a run to learn that
+    the input is wrong. A run may start again in order to solve the poses. This second attempt may take a warning back.
+    told: the warnings that are printed already."""
 
     told: list[str] = field(default_factory=list)
 
@@ -47,13 +48,13 @@ class SpeakingLedger(Ledger):
         _say_warnings(new)
 
     def taken_back(self) -> list[str]:
-        """Return the warnings that are printed, and no longer in the ledger."""
+        """Return the warnings that were printed but are no longer in the ledger."""
         return [one for one in self.told if one not in self.warnings]
 
 
 def report(ledger: Ledger) -> None:
-    """Print each drop and warning of a ledger as one line on stderr, without the warnings that are printed already. Name the
-    printed warnings that are no longer true."""
+    """Print each drop and warning of a ledger as one line on stderr. Leave out the warnings that are printed already. Name
+    the printed warnings that were taken back."""
     told, back = (ledger.told, ledger.taken_back()) if isinstance(ledger, SpeakingLedger) else ([], [])
     _say_warnings([line for line in ledger.lines() if line not in told])
     for line in back:
@@ -67,11 +68,12 @@ def _say_warnings(lines: list[str]) -> None:
 
 @contextmanager
 def progress_bar(ledger: SpeakingLedger | None = None, *, quiet: bool = False) -> Iterator[Show]:
-    """Show the progress on stderr: as a bar on a terminal, else as a plain line now and then. Print warnings meanwhile.
+    """Show the progress on stderr: as a bar on a terminal, else as a plain line every `_EVERY` seconds.
 
-    Yield a function that updates it. It takes the stage name, the number of finished items, and the total number of items, 0
-    if unknown. The bar shows the time since the stage began, and how many items it finishes in a second. quiet: whether to
-    print no lines of progress. ledger: its new warnings are printed every `_EVERY` seconds, also with `quiet`.
+    Yield the function that updates the progress. It takes the name of the stage, the number of finished items, and the
+    number of all items (0 if unknown). The bar shows the time since the start of the stage, and the number of items finished
+    per second. ledger: the ledger whose new warnings are printed every `_EVERY` seconds. quiet: whether to print no lines of
+    progress. Warnings are printed even if `quiet` is True.
     """
     with _bar() if console(stderr=True).is_terminal else _lines(quiet) as (show, tell), _now_and_then(ledger, tell):
         yield show
@@ -106,7 +108,7 @@ def _bar() -> Iterator[tuple[Show, Callable[[], None]]]:
 
         def show(stage: str, done: int, total: int) -> None:
             nonlocal shown, task
-            if stage != shown:  # rich stops the clock of a finished task, and never forgets a total.
+            if stage != shown:  # A stage needs a new task: rich stops the clock of a finished task and keeps its total.
                 bar.remove_task(task)
                 shown, task = stage, bar.add_task(printable(stage), total=total or None)
             bar.update(task, completed=done, total=total or None)
@@ -116,7 +118,7 @@ def _bar() -> Iterator[tuple[Show, Callable[[], None]]]:
 
 @contextmanager
 def _lines(quiet: bool) -> Iterator[tuple[Show, Callable[[], None]]]:
-    """Yield two functions. The first one takes the newest stage. The second one prints it, unless `quiet`."""
+    """Yield two functions. The first one stores the newest progress. The second one prints it, unless `quiet` is True."""
     begin, newest = time.monotonic(), ("reading", 0, 0)
 
     def show(stage: str, done: int, total: int) -> None:
@@ -153,8 +155,8 @@ def _now_and_then(ledger: SpeakingLedger | None, tell: Callable[[], None]) -> It
 
 
 def warn_of_neighbours(out: Path) -> None:
-    """Warn if the folder of a result contains other files and no result yet, because the files of the result will be among
-    them."""
+    """Warn if the folder for a result contains other files and no older result. The files of the result would be among the
+    other files."""
     from objslam.output.result_folder import foreign_files
 
     if found := foreign_files(out):
@@ -164,18 +166,18 @@ def warn_of_neighbours(out: Path) -> None:
 
 
 def console(*, stderr: bool = False) -> Console:
-    """Return the console of stdout or stderr. It has the width of the terminal, or COLUMNS. Without both it is 120 columns.
+    """Return the console of stdout or stderr. Its width is COLUMNS, else the width of the terminal, else 120 characters.
 
-    Each stream has one console, so that a line printed during a progress bar or status line does not mix with it. The
-    console has no markup: it prints [red] and :smile: as they are. `printable` replaces characters that cannot be printed.
+    Each stream has one console, so that printed lines do not mix with a progress bar or a status line. The console has no
+    markup: it prints [red] and :smile: as they are. `printable` replaces characters that cannot be printed.
     """
     return console_of(stderr)
 
 
 @functools.cache
 def console_of(stderr: bool, /) -> Console:
-    """Return the one console of a stream. The cache takes `f(True)` and `f(stderr=True)` for two calls, so only `console`
-    calls this."""
+    """Return the only console of a stream. Only `console` may call this function, because the cache treats `f(True)` and
+    `f(stderr=True)` as different calls."""
     from rich.console import Console
 
     class Plain(Console):
@@ -186,15 +188,15 @@ def console_of(stderr: bool, /) -> Console:
 
 
 def width(*, stderr: bool = False) -> int | None:
-    """Return how many characters a line of stdout or stderr has: the width of the terminal, or COLUMNS. None for any other
-    pipe."""
+    """Return the number of characters in a line of stdout or stderr: COLUMNS, else the width of the terminal. Return None if
+    the stream is not a terminal and COLUMNS is not set."""
     return console(stderr=stderr).width if _is_narrow(stderr) else None
 
 
 def say(text: str, *, stderr: bool = False, style: str | None = None) -> None:
-    """Print a sentence, wrapped between words if lines have a width (`width`).
+    """Print a sentence. If lines have a width (`width`), the sentence is wrapped between words.
 
-    A longer word, such as a path, stays whole. rich would cut it. style: as rich names it, such as "bold".
+    A word that is longer than a line, such as a path, stays whole. rich would cut it. style: a rich style, such as "bold".
     """
     most = width(stderr=stderr)
     lines = text.split("\n")
@@ -204,7 +206,7 @@ def say(text: str, *, stderr: bool = False, style: str | None = None) -> None:
 
 
 def put(text: str, *, stderr: bool = False, style: str | None = None) -> None:
-    """Print a text that is not wrapped: data for programs, or a command to copy. The text ends its own lines."""
+    """Print a text without wrapping it, such as data for programs or a command to copy. No line end is added."""
     console(stderr=stderr).print(text, style=style, end="", soft_wrap=True)
 
 

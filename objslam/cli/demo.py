@@ -15,7 +15,8 @@ from objslam.cli.run import run_log
 
 def demo(
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Folder for log and results. [default: demo_out, --boxes: demo_boxes]")
+        Path | None,
+        typer.Option("-o", "--out", help="Folder for log and results. Default: demo_out, or demo_boxes with --boxes."),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random room and drive.")] = 0,
     boxes: Annotated[

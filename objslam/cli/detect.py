@@ -14,14 +14,14 @@ from objslam.cli.options import ClassNames, Config, EncoderModel, Json, Set, set
 def detect(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="An ONNX detector.")],
     image: Annotated[Path, typer.Argument(metavar="IMAGE", help="A photo: PNG, JPEG, ...")],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="PNG or JPEG file for the boxes on the photo.")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="PNG or JPEG file for the photo with boxes.")] = None,
     embed: EncoderModel = None,
     config: Config = None,
     set_: Set = None,
     names: ClassNames = None,
     json: Json = False,
 ) -> None:
-    """Try a detector on one photo: say how the model is read, and which boxes it finds. No log is needed."""
+    """Try a detector on one photo. Print how the model's outputs are read, and which boxes it finds. No log is needed."""
     from objslam.detection import load_detector, load_encoder
     from objslam.errors import ConfigError, LogError
     from objslam.io.atomic_files import write_file

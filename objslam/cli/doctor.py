@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SPOILT = 1
 """The exit code if the input has an error that makes the positions of a map unreliable."""
-_ROWS = 8  # The most hypotheses in the table, besides the log as it is. Other hypotheses explain less.
+_ROWS = 8  # The largest number of hypotheses in the table, besides the log as it is. The other hypotheses explain less.
 
 
 @with_options
@@ -31,7 +31,7 @@ def doctor(
     *,
     options: SourceOptions,
 ) -> None:
-    """Look for wrong input: units, axes, stamps, boxes, calibration. Nothing is changed and nothing is written.
+    """Look for wrong units, axes, stamps, boxes and calibrations in a log. Nothing is changed, and nothing is written.
 
     The exit code is 1 if the input has an error that makes the positions of a map unreliable.
     """
@@ -79,7 +79,8 @@ def doctor(
 
 
 def _solved(log: Log, settings: Settings, show: Progress) -> list[dict[str, Any]] | None:
-    """Return the findings that a run still has after its solve, as summary.json has them. None if the solve fails."""
+    """Return the findings that remain after a run has solved the poses, in the form of summary.json. Return None if the
+    solve fails."""
     from objslam.core.diagnostics import Ledger
     from objslam.errors import SolveError
     from objslam.mapping.pipeline import run
@@ -95,9 +96,9 @@ def _solved(log: Log, settings: Settings, show: Progress) -> list[dict[str, Any]
 
 
 def _show_trials(found: Diagnosis) -> None:
-    """Print how well the boxes fit: with the log as it is, and with the corrections (hypotheses) that make them fit best.
+    """Print a table of how well the boxes fit: with the log as it is, and with the corrections that make them fit best.
 
-    If there is no finding, or nothing was compared, print one line instead of the table.
+    Such a correction is called a hypothesis. If there is no finding, or if no boxes were compared, print one line instead.
     """
     from rich.table import Table
 

@@ -25,16 +25,16 @@ def evaluate_result(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Compare a result with the ground truth: matched, missed and false objects, errors of the positions and of the path."""
+    """Compare a result with the ground truth. Print matched, missed and false objects, and errors of positions and path."""
     print_evaluation(out, truth, align, radius, json, quiet)
 
 
 def print_evaluation(
     out: Path, truth: Path | None, align: AlignmentChoice, radius: float, json: bool = False, quiet: bool = False
 ) -> None:
-    """Evaluate a result folder, write evaluation.json into it, and print the table, or with `json` the file's content.
+    """Evaluate a result folder, write evaluation.json into the folder, and print a table.
 
-    quiet: print nothing.
+    json: whether to print the content of evaluation.json instead of the table. quiet: whether to print nothing.
     """
     from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
     from objslam.evaluation.table import evaluation_table

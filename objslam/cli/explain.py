@@ -33,7 +33,7 @@ def explain(
     label: Annotated[str | None, typer.Option("--label", help="Only objects and boxes with this label.")] = None,
     json: Json = False,
 ) -> None:
-    """Say what is doubtful in a result, and why: objects that may be one or two, and boxes that became no object."""
+    """Say what is doubtful in a result, and why. For example, two objects may be one, or boxes became no object."""
     from objslam.errors import ConfigError, OutputError
     from objslam.io.results.files import DOUBTS, SUMMARY
     from objslam.io.results.read import load_doubts, load_summary
@@ -70,7 +70,7 @@ def explain(
 def _labels(out: Path, doubts: Sequence[Doubt], cut: Iterable[str]) -> list[str]:
     """Return the labels of the result's objects, boxes and doubts, in the order of the alphabet.
 
-    cut: the labels of the boxes that are cut off.
+    cut: the labels of the boxes that the image's edge cuts off.
     """
     from objslam.io.results.read import load_map, load_rays
 
@@ -79,7 +79,7 @@ def _labels(out: Path, doubts: Sequence[Doubt], cut: Iterable[str]) -> list[str]
 
 
 def doubts_table(doubts: Sequence[Doubt], title: str) -> Table:
-    """Return a table of the doubts of one kind: the label, and the sentence."""
+    """Return a table of the doubts of one kind. A row has the label of a doubt, and the sentence that explains it."""
     from rich.table import Table
 
     table = Table(title=title, show_lines=len(doubts) > 1)

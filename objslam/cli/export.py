@@ -12,7 +12,7 @@ from objslam.output.export.formats import FORMATS
 _HELP = " ".join(f"{known.name}: {known.help}." for known in FORMATS.values())
 _DATUM_HELP = (
     f"{', '.join(known.name for known in FORMATS.values() if known.takes_datum)}: latitude and longitude of the map origin "
-    "(WGS 84, degrees), and heading of the x axis (degrees clockwise of north). Without it, coordinates are in m in the map."
+    "(WGS 84, degrees), and heading of the x axis (degrees clockwise of north). Without --datum: m in the frame of the map."
 )
 
 

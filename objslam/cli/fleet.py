@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 _GB = 1e9
 _RAY_MEMORY = 4.0
 """The memory limit of a task on a cluster, GB, if the user gives none. With a larger value, larger logs can be mapped."""
-_TENTHS = 10  # The lines of progress of a stage, if stderr is no terminal. More lines show the progress more finely.
+_TENTHS = 10
+"""The number of lines of progress of a stage if stderr is not a terminal. More lines show the progress in smaller steps."""
 
 Sources = Annotated[
     list[str], typer.Argument(metavar="SOURCE...", help="Logs, folders with logs, glob patterns, or URLs such as s3://...")
@@ -33,14 +34,15 @@ By = Annotated[
     str,
     typer.Option(
         "--by",
-        help="How a log gets its site: from a field of --layout, or from its `folder`. `none`: all logs are one site.",
+        help="What names the site of a log: a field of --layout, or `folder` (its folder). `none`: all logs are one site.",
     ),
 ]
 LayoutOption = Annotated[
-    str, typer.Option("--layout", help="The folders above a log, as {site}/{robot}/{day}/{log}. A log is the last part.")
+    str,
+    typer.Option("--layout", help="The folders above a log, such as {site}/{robot}/{day}/{log}. {log} is the log itself."),
 ]
 Jobs = Annotated[
-    int | None, typer.Option("-j", "--jobs", min=1, help="Processes of this machine. [default: one for each core]")
+    int | None, typer.Option("-j", "--jobs", min=1, help="Number of processes on this machine. Default: one per core.")
 ]
 RayAddress = Annotated[
     str | None,
@@ -51,17 +53,17 @@ MemoryLimit = Annotated[
     typer.Option(
         "--memory",
         min=0.0,
-        help="Memory limit of a task, GB; 0 for none. [default: an equal share of this machine; 4 with --ray]",
+        help="Memory limit of a task, GB. 0: no limit. Default: an equal share of this machine, or 4 with --ray.",
     ),
 ]
-TimeLimit = Annotated[float, typer.Option("--time-limit", min=0.0, help="Time limit of a task, s; 0 for none.")]
-Retries = Annotated[int, typer.Option("--retries", min=0, help="How often a task is started again after its process died.")]
+TimeLimit = Annotated[float, typer.Option("--time-limit", min=0.0, help="Time limit of a task, s. 0: no limit.")]
+Retries = Annotated[int, typer.Option("--retries", min=0, help="How often a task is started again if its process dies.")]
 Gpus = Annotated[
     float, typer.Option("--gpus", min=0.0, help="With --ray and --detector: the share of a GPU that each task takes.")
 ]
 Again = Annotated[bool, typer.Option("--retry-failed", help="Map again the logs that failed because of their content.")]
 WithReport = Annotated[bool, typer.Option("--report", help="Write report.html for each log.")]
-Price = Annotated[float | None, typer.Option("--price", min=0.0, help="Price of an hour of one core, for the column cost.")]
+Price = Annotated[float | None, typer.Option("--price", min=0.0, help="Price of one core per hour, for the column `cost`.")]
 FAILED = 1
 """The exit code of a fleet in which a log or a site failed."""
 
@@ -93,8 +95,9 @@ def fleet(
 ) -> None:
     """Map many logs, each as one task, and merge the results of each site to one map.
 
-    A second run does only what is missing or changed. The exit code is 1 if a log or a site failed, and failed.parquet
-    names each. The recording for the viewer is left out unless --set output.recording=true.
+    A second run does only what is missing or changed.
+    The exit code is 1 if a log or a site failed. failed.parquet lists them.
+    Results have no recording for the viewer, unless --set output.recording=true.
     """
     from objslam.fleet.driver import run_fleet
     from objslam.fleet.engines.local_engine import cores, local_engine, memory_of_machine
@@ -194,7 +197,8 @@ def _shown() -> Iterator[Tell]:
 
 
 def _progress(done: int, failed: int, running: int, total: int, first: int, seconds: float) -> str:
-    """Return the progress in words. first: the tasks that had ended at the first call. seconds: the time since then, s."""
+    """Return the progress in words. first: the number of tasks that had ended when the stage began. seconds: the time since
+    the stage began, s."""
     by_now = done + failed - first
     line = f"{done} of {total} done, {failed} failed, {running} running, {total - done - failed - running} to do"
     if by_now <= 0 or seconds <= 0:

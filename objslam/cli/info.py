@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 
 _NUMERIC = ("messages", "Hz", "gap s", "from s", "to s")  # The right-aligned columns of numbers.
 _OTHER_CLOCK = 86400.0
-"""Header stamps that begin farther from the recording than this, s, are on another clock. The stamps of a simulation are
-decades off, and those of a robot whose clock is wrong mostly minutes. With a larger value, more clocks count as the same."""
+"""The largest time from the start of a recording to the first header stamp of a topic on the same clock, s. The stamps of a
+simulation are decades off. A wrong clock of a robot is mostly minutes off. With a larger value, more clocks count as the
+same."""
 _SPARE = ("from s", "to s", "frame", "what", "gap s", "type")
 """The columns that are left out on a narrow terminal, in this order. `--json` has them all."""
 
@@ -35,7 +36,7 @@ def info(
     options: SourceOptions,
     json: Json = False,
 ) -> None:
-    """Describe a recording: streams, rates, gaps, times, the role of each topic, and what is missing for a run."""
+    """Describe a recording: its streams with rates, gaps and times, the role of each topic, and what a run lacks."""
     from objslam.core.diagnostics import Ledger
     from objslam.io.results.files import dump_json
     from objslam.mapping.checks.boxes import check_boxes
@@ -77,7 +78,8 @@ def _show_log(found: Contents, kind: Source) -> None:
 
 
 def _show_bag(bag: BagInfo, part: Contents | None) -> None:
-    """Show all topics of the bag, so that the user can choose among them. Then show the part that was asked for."""
+    """Show all topics of the bag, so that the user can choose among them. Then show the streams of the part of the bag that
+    the options choose."""
     from objslam.core.diagnostics import is_drop
     from objslam.sources.summary import in_words
 
@@ -153,7 +155,7 @@ def _span(start: float, end: float) -> str:
 
 
 def _table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows of text in aligned columns. On narrow lines, `_SPARE` columns are left out. No text is cut."""
+    """Print rows of text in aligned columns. If lines are too narrow, columns of `_SPARE` are left out. No text is cut."""
     most = width()
     for spare in (None, *_SPARE):
         if spare in names:

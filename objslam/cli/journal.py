@@ -18,7 +18,7 @@ Journal = Annotated[Path, typer.Argument(metavar="JOURNAL", help="journal.objsla
 
 @journal_app.command()
 def verify(journal: Journal) -> None:
-    """Check every segment of a journal. Exit code 1 if one is damaged or missing."""
+    """Check every segment of a journal. The exit code is 1 if a segment is damaged or missing."""
     from objslam.errors import LogError
     from objslam.sources.journal import maintenance
 
@@ -33,7 +33,7 @@ def verify(journal: Journal) -> None:
 
 @journal_app.command()
 def repair(journal: Journal) -> None:
-    """Leave out what is damaged, so that the rest is sound again. The damaged files are kept under another name."""
+    """Remove the damaged parts of a journal, so that the rest is sound. The damaged files are kept under other names."""
     from objslam.sources.journal import maintenance
 
     made = maintenance.repair(journal)

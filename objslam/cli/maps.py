@@ -24,7 +24,10 @@ def register_results(
     a: Annotated[Path, typer.Argument(metavar="A", help="A result folder, or an objects.json.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="The other map.")],
 ) -> None:
-    """Find the transform from map A to map B by the relative positions of their objects. Exit code 1 if it is uncertain."""
+    """Find the transform from map A to map B by the relative positions of their objects.
+
+    The exit code is 1 if the transform is uncertain.
+    """
     import numpy as np
 
     from objslam.association.registration.object_maps import reason, register
@@ -58,9 +61,11 @@ def merge_results(
 ) -> None:
     """Join the maps of several sessions to one map of the site, with the life of each object.
 
-    Give the sessions in the order of time. The first one gives the frame. Each session is registered to the map of the
-    others, so the time grows with their number. Sessions that share no objects stay apart, each group in a folder of its
-    own. To add a session later, give the site and the new result.
+    Give the sessions in the order of time. The map has the frame of the first
+    session. Each session is registered to the map of the sessions placed so far,
+    so the time grows with the number of sessions. Sessions that share no objects
+    stay apart, each group in a folder of its own. To add a session later, give
+    the site and the new result.
     """
     from objslam.api.sites import load_session, warnings_of
     from objslam.core.object_map import FATES
@@ -107,10 +112,14 @@ def diff_results(
 ) -> None:
     """Compare two maps of one place: which objects are confirmed, moved, gone, new or unconfirmed.
 
-    An object is unconfirmed if only one map has it, and the other drive did not have its place in view. The ids are from map
-    A and map B. The result of a live session does not say what was in view. So if it is map B, no object counts as gone or
-    moved: run its journal (objslam run LIVE_RESULT -o AGAIN), and compare that. The exit code is 1 if the maps cannot be
-    registered to each other.
+    An object is unconfirmed if only one map has it, and the other drive did not
+    have its place in view. The ids are from map A and map B.
+
+    The result of a live session does not say what was in view. If it is map B, no
+    object counts as gone or moved. In this case, map the journal of the session
+    (objslam run LIVE_RESULT -o AGAIN), and compare the new result.
+
+    The exit code is 1 if the maps cannot be registered to each other.
     """
     from objslam.api.sites import diff
     from objslam.core.object_map import FATES
@@ -140,7 +149,7 @@ def diff_results(
 
 
 def _not_in_view(found: Comparison, a: Path, b: Path) -> list[str]:
-    """Return a warning for each map that does not say what was in view: what the comparison then cannot show, and why."""
+    """Return a warning for each map that does not say what was in view. A warning says what the comparison cannot show."""
     from objslam.io.results.files import VIEWS
     from objslam.sources.journal.record_format import NAME
 

@@ -51,8 +51,8 @@ PriorMapPath = Annotated[
     typer.Option(
         "--map",
         metavar="MAP",
-        help="The map of another day: an objects.json, or a result folder. If the drive is found in it, the result is in "
-        "its frame.",
+        help="The map of another day: an objects.json, or a result folder. If the drive is found in this map, the result is "
+        "in the frame of this map.",
     ),
 ]
 Align = Annotated[
@@ -75,13 +75,13 @@ EncoderModel = Annotated[
     typer.Option(
         "--embed",
         metavar="MODEL",
-        help="ONNX image encoder. It makes an appearance vector of each box from the rgb images.",
+        help="ONNX image encoder. It makes an appearance vector for each box from the rgb image of the box.",
     ),
 ]
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print warnings and errors only.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for programs in place of text.")]
 CalibrationFile = Annotated[
-    Path | None, typer.Option("--calibration", help="File of `objslam calibrate` with the robot's shared errors.")
+    Path | None, typer.Option("--calibration", help="The file that `objslam calibrate` wrote for this robot.")
 ]
 
 
@@ -92,9 +92,9 @@ def settings_of(
     calibration: Path | None = None,
     names: str | None = None,
 ) -> Settings:
-    """Load the settings from --config, --set, --calibration, --names and --mode. --set overrides all others, and all others
-    override --config. Files of a calibration and of names are read too, so that a wrong file fails before a long log is
-    read."""
+    """Load the settings from --config, --set, --calibration, --names and --mode. --set overrides the other options, and all
+    of them override --config. The files of --calibration and --names are checked, so that a wrong file fails before a long
+    log is read."""
     import yaml
 
     from objslam.config import load_settings
@@ -119,8 +119,8 @@ def settings_of(
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with flags in place of its parameter `options`. Each field with an `Option` in the class of
-    `options` becomes one flag."""
+    """Return the command with flags in place of its parameter `options`. In the class of `options`, each field with an
+    `Option` becomes one flag."""
     signature = inspect.signature(command, eval_str=True)
     kind = signature.parameters["options"].annotation
     declared = flags(kind)
@@ -159,5 +159,5 @@ def _parameter(name: str, type_: Any, option: Option, default: Any) -> inspect.P
 
 
 def _is_negated(option: Option, default: Any) -> bool:
-    """Return whether the flag turns off what is on by default, as --without-range does."""
+    """Return whether the flag turns an option off that is on by default, as --without-range does."""
     return default is True and "/" not in option.flag

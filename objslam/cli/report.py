@@ -14,19 +14,21 @@ def report_result(
     log: Annotated[
         Path | None, typer.Option("--log", help="The log with the images. Default: the log that the run read.")
     ] = None,
-    crops: Annotated[int, typer.Option("--crops", min=0, max=50, help="Image crops of each object (its best boxes).")] = 4,
+    crops: Annotated[
+        int, typer.Option("--crops", min=0, max=50, help="Number of image crops of an object: its best boxes.")
+    ] = 4,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Write report.html with the map in 3D, objects, residuals, evaluation and settings of a result. It works offline.
 
-    The page of a site has its sessions, and what became of each object.
+    The page of a site shows its sessions, and what became of each object.
     """
     from objslam.io.results.files import dump_json
     from objslam.output.report import write_report
 
     with progress_bar(quiet=quiet) as show:
-        # Who names a log wants its pictures, and a page with them must not give way to one without.
+        # A user who names a log wants its images. A page without images must not replace a page with images.
         file = write_report(out, log=log, crops=crops, images_needed=log is not None, progress=show)
     if json and not quiet:
         put(dump_json({"wrote": str(file)}))

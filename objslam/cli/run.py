@@ -63,11 +63,11 @@ _NOISE: Final = {
     "heading": "heading of the poses",
     "place": "place of the poses",
 }
-"""The names of the noise factors in the output. A factor of 1 is not shown: the log does not determine it, or confirms the
-settings."""
+"""The names of the noise factors in the output. A factor of 1 is not shown. It means that the log does not determine the
+noise, or that the noise is as set."""
 NOT_LOCALISED = 3
-"""The exit code of a run that wrote its result, but was not found in the map that --map names."""
-_WIDE = 10_000  # The width, in characters, of a terminal on which no table is cut, to measure the full width of a table.
+"""The exit code of a run that wrote its result, but whose drive was not found in the map of --map."""
+_WIDE = 10_000  # A width that no table has, characters. In a console of this width, the full width of a table is measured.
 
 
 @with_options
@@ -116,10 +116,11 @@ def run_log(
     known: PriorMap | None = None,
     embed: Path | None = None,
 ) -> RunResult:
-    """Map the objects of a log, write the result folder, and print a summary. A `detector` replaces the boxes of the log.
+    """Map the objects of a log, write the result folder, and print a summary.
 
-    tell: prints the summary; `say_result` by default. known: the map of another day in which the drive is to be found.
-    embed: the encoder that gives the boxes their appearance vectors.
+    detector: the ONNX detector whose boxes replace the boxes of the log. tell: the function that prints the summary, by
+    default `say_result`. known: the map of another day, in which the run looks for the drive. embed: the ONNX encoder that
+    makes the appearance vectors of the boxes.
     """
     import time
 
@@ -155,7 +156,8 @@ def _say_json(result: RunResult, more: str, out: Path, removed: tuple[str, ...])
 
 
 def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
-    """Print the objects, a line with the counts and `more`, the names of `removed` files of an older result, and `out`."""
+    """Print the objects and the summary of a result. more: the text after the counts. out: the result folder. removed: the
+    names of the files of an older result that were removed."""
     if result.map.objects:
         console().print(objects_table(result.map.objects, console()))
     if advice := advice_on_tags(result.map.objects, result.settings.tags):
@@ -196,23 +198,23 @@ def _number(value: float, digits: int) -> str:
 
 
 def _size(o: MapObject) -> str:
-    """Return length, width and height of the body of an object, or the side of a fiducial. "" for a point."""
+    """Return length, width and height of an object's body as text, m. Return the side of a fiducial, and "" for a point."""
     if o.tag is not None:
         return f"{o.tag.size:.3f}"
     return "" if o.body is None else " x ".join(f"{side:.2f}" for side in o.body.size)
 
 
 def advice_on_tags(objects: Sequence[MapObject], given: Tags) -> str:
-    """Return what to do if the sizes of fiducials are estimated. "" if there are no such fiducials."""
+    """Return advice to the user if the sizes of fiducials are estimated. Return "" if there are no such fiducials."""
     if not any(o.tag is not None and given.size_of(o.label) is None for o in objects):
         return ""
     return "the sides of tags are estimated in the scale of the poses; a known side sets the scale: --set tags.size=METRES"
 
 
 def objects_table(objects: Sequence[MapObject], screen: Console) -> Table:
-    """Return a table of objects by label and id, without empty columns.
+    """Return a table of objects, sorted by label and id, without empty columns.
 
-    The `_SPARE` columns that the screen has no room for are left out, so that no number is cut.
+    Columns of `_SPARE` for which the screen has no room are left out, so that no number is cut.
     """
     from rich.measure import Measurement
     from rich.table import Table

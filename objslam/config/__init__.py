@@ -1,5 +1,5 @@
-"""The settings: nested sections with a default for every value, changed by YAML files and `--set key=value`. Values that
-describe objects, rooms or robots are settings. Values that only a method needs are constants in the code."""
+"""The settings of a run, in nested sections. Every setting has a default. YAML files and `--set key=value` change settings.
+Values that describe objects, rooms or robots are settings. Values that only a method needs are constants in the code."""
 
 from objslam.config.calibration import CalibrationSettings
 from objslam.config.detector import Detector

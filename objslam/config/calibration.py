@@ -1,4 +1,5 @@
-"""The settings of the calibration: which shared errors are estimated, and how large they may be."""
+"""The settings of the calibration: which errors that all measurements share are estimated, and how large these errors may
+be."""
 
 from typing import Literal
 
@@ -6,68 +7,70 @@ from objslam.config.section import NotNegative, Positive, Section
 
 
 class CalibrationSettings(Section):
-    """Errors that all measurements of a robot share. Each number except max_clock is the prior standard deviation of an
-    error. With 0, the error is not estimated: it is 0, or the value in `file`."""
+    """Configure the errors that all measurements of a robot share. Each number except max_clock is the prior standard
+    deviation of the error that its text describes. With 0, the error is not estimated. It is then 0, or it has its value in
+    `file`."""
 
     use: Literal["auto"] | bool = "auto"
-    """auto: in joint mode, estimate all errors. In fixed mode, estimate the errors of cameras if the log has a localisation
-    that is not coarse. If base_T_camera is the identity, the poses are of the camera, so its rotation and place are not
-    estimated. true: estimate them too, and in fixed mode also from coarse poses. false: never estimate."""
+    """Which errors are estimated. auto: in joint mode, all errors. In fixed mode, the errors of the cameras, if the log has
+    a localisation and `localization.xy` is less than 0.3 m. If base_T_camera of a camera is the identity, the poses are
+    those of the camera. auto then does not estimate the rotation, place and lens of this camera. true: estimate these errors
+    too, and in fixed mode also with a less accurate localisation. false: estimate none."""
     file: str | None = None
-    """a file of `objslam calibrate`, or the summary.json of a run. Its values and covariance are the prior of its errors. An
-    error of the file that is not estimated keeps its value from the file."""
+    """File of `objslam calibrate`, or the summary.json of a run. Its values and covariance are the prior of its errors. If
+    an error of the file is not estimated, it keeps its value from the file."""
     scale: NotNegative = 0.03
-    """share by which all distances of the odometry are too long or too short."""
+    """Scale error of the odometry, as a share of each distance. The odometry says too long or too short distances."""
     lateral_scale: NotNegative = 0.1
-    """share by which the sideways distances of the odometry are too long or too short, beside `scale`. Mecanum and omni
+    """Scale error of the sideways distances of the odometry, as a share. It acts in addition to `scale`. Mecanum and omni
     wheels slip as they go sideways. It is estimated only if the robot drives sideways."""
     turn_scale: NotNegative = 0.05
-    """share by which all turns of the odometry are too large or too small."""
+    """Scale error of the turns of the odometry, as a share of each turn."""
     turn_bias: NotNegative = 0.003
-    """rad/s; the turn rate that the odometry adds at all times, as a gyroscope without calibration does."""
+    """Turn rate in rad/s that the odometry adds at all times, as a gyroscope without calibration does."""
     turn_per_m: Literal["auto"] | NotNegative = "auto"
-    """rad/m; the turn that the odometry adds for each metre ahead. If the wheels are 0.3 m apart, and one is 0.3 % larger
-    than the other, it is 0.01. auto: 0, unless the map shows a gross error."""
+    """Turn in rad/m that the odometry adds for each metre ahead. It is 0.01 if the wheels are 0.3 m apart and one wheel is
+    0.3 % larger than the other. auto: 0, unless the map shows a gross error."""
     turn_slip: NotNegative = 0.02
-    """m per rad; the distance by which the odometry is too long for each radian of turning. A robot with tracks or four
-    driven wheels slips in curves, and an odometry that takes the speed of the outer wheel is too long by half the track. In
-    a sharp curve of 1 m radius, 0.02 is 2 % of the distance."""
+    """Distance in m by which the odometry is too long for each rad of turning. A robot with tracks or with four driven
+    wheels slips in curves. An odometry that uses the speed of the outer wheel is too long by half the track width for each
+    rad. In a curve with a radius of 1 m, 0.02 is 2 % of the distance."""
     clock: NotNegative = 0.1
-    """s; the offset of each camera's clock against the clock of the poses."""
+    """Offset in s of the clock of each camera from the clock of the poses."""
     max_clock: Positive = 0.5
-    """s; the largest clock offset that is considered."""
+    """Largest clock offset in s that is considered."""
     odometry_clock: bool = True
-    """whether the stamps of the odometry are corrected if they are clearly early or late against those of the localisation.
-    If `use` is false, they are not."""
+    """Correct the stamps of the odometry if they are clearly early or late against the stamps of the localisation. They are
+    never corrected if `use` is false."""
     yaw: NotNegative = 0.03
-    """rad; the rotation of each camera on the base about the vertical axis."""
+    """Rotation error in rad of each camera on the base about the vertical axis."""
     tilt: NotNegative = 0.02
-    """rad; the rotation of each camera on the base about the sideways axis."""
+    """Rotation error in rad of each camera on the base about the sideways axis."""
     roll: NotNegative = 0.02
-    """rad; the rotation of each camera on the base about the forward axis."""
+    """Rotation error in rad of each camera on the base about the forward axis."""
     translation: Literal["auto"] | NotNegative = "auto"
-    """m; the offset of each camera's place on the base, along each axis. auto: 0.05 in fixed mode and with a localisation,
-    0.02 in joint mode with odometry beside it, and 0 in joint mode with odometry alone, unless its map shows a gross
-    error."""
+    """Position error in m of each camera on the base, along each axis. auto: 0.05 in fixed mode, and in joint mode with a
+    localisation alone. 0.02 in joint mode with a localisation and odometry. 0 in joint mode with odometry alone, unless the
+    map shows a gross error."""
     range_scale: NotNegative = 0.02
-    """share by which all ranges are too long or too short. Data sheets of depth cameras promise 2 % of the distance, and six
-    recorded runs of two kinds of sensors err by 1.2 to 2.3 %."""
+    """Scale error of all ranges, as a share of the range. Data sheets of depth cameras promise 2 % of the distance. Six
+    recorded runs with two kinds of sensors have errors of 1.2 to 2.3 %."""
     range_offset: NotNegative = 0.05
-    """m by which all ranges are too short, along the optical axis. The zero of a depth sensor and the place of its camera,
-    which was measured with a ruler, both err. It is estimated in joint mode only."""
+    """Length in m by which all ranges are too short, along the optical axis. It has two causes: the zero point of a depth
+    sensor, and the place of its camera, which was measured with a ruler. It is estimated in joint mode only."""
     surface: NotNegative = 0.3
-    """error of depth.centre that all things of a log share, as a share of half their width. It is positive if the centres
-    are farther behind the visible surfaces. It is estimated in joint mode only."""
+    """Error of depth.centre that all things of a log share, as a share of half their width. A positive error means that the
+    centres are farther behind the visible surfaces. It is estimated in joint mode only."""
     tag_scale: NotNegative = 0.01
-    """share by which all fiducials of a given size are smaller or larger than the settings say. A printer, a ruler, the lens
-    and the detector of the corners each add to it. It is estimated in joint mode only."""
+    """Error of the given sizes of all fiducials, as a share of the size. The printer, the ruler, the lens and the detector
+    of the corners contribute to it. It is estimated in joint mode only."""
     focal: Literal["auto"] | NotNegative = "auto"
-    """share by which the focal length of each camera is too long or too short. auto: 0.02 in fixed mode and with a
-    localisation. In joint mode with odometry alone, it is estimated only if the map shows a gross error. Otherwise the
-    covariances contain 0.02. 0: it is exact."""
+    """Error of the focal length of each camera, as a share of this length. auto: 0.02 in fixed mode, and in joint mode with
+    a localisation. In joint mode with odometry alone, auto estimates it only if the map shows a gross error. Otherwise, the
+    covariances contain an error of 0.02. With 0, the focal length is exact."""
     centre: NotNegative = 0.02
-    """share of the focal length by which the image centre of each camera is off, along each axis. The
-    default is usual for a centre that is assumed in the middle of the image. A calibrated centre errs by less."""
+    """Error of the image centre of each camera along each axis, as a share of the focal length. The default is usual for a
+    camera whose centre is assumed in the middle of the image. The error of a calibrated centre is smaller."""
 
     @property
     def corrects_odometry_clock(self) -> bool:

@@ -1,4 +1,4 @@
-"""The settings of the checks that name wrong input."""
+"""The settings of the checks that find wrong input."""
 
 from objslam.config.section import Section
 
@@ -7,4 +7,4 @@ class Checks(Section):
     """Configure the checks of the input in every run. `objslam doctor` runs them all."""
 
     use: bool = True
-    """Look for wrong input, and give no object the status ok if it is found. false skips the search."""
+    """Check the input, and give no object the status ok if the input is wrong. false: do not check the input."""

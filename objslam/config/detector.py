@@ -16,29 +16,32 @@ Activation = Literal["none", "sigmoid", "softmax"]
 
 
 class Detector(Section):
-    """Configure the ONNX model that detects boxes in the images of a log. A setting of null is inferred from the model's
-    metadata, from the shapes of its outputs, or from its model family."""
+    """Configure the ONNX model that detects boxes in the images of a log. If a setting is null, its value comes from the
+    model's metadata, from the shapes of its outputs, or from its model family."""
 
     layout: Layout | None = None
-    """Layout of the outputs. ssd: boxes, labels, scores (SSD, torchvision, TensorFlow). In ssd, one output may hold boxes
-    and scores. yolov8: box, classes (v8, v11, v12). yolov5: box, objectness, classes (v5, v7). end_to_end: corners, score,
-    class (v10, v26). yolox: raw grid. yolox_decoded: grid that the exported model decodes. detr: boxes, logits."""
+    """Layout of the model outputs. ssd: boxes, labels and scores (SSD, torchvision, TensorFlow). Boxes and scores may be in
+    one output. yolov8: box and class scores (v8, v11, v12). yolov5: box, objectness and class scores (v5, v7). end_to_end:
+    corners, score and class (v10, v26). yolox: raw grid. yolox_decoded: grid that the exported model decodes. detr: boxes
+    and logits."""
     outputs: dict[Role, str] | None = None
-    """Name of the model output for each role. In ssd, the roles are boxes, labels and scores. Without an output for scores,
-    the scores are the fifth column of boxes. In detr, the roles are boxes and logits, or predictions alone. In every other
-    layout, the only role is predictions."""
+    """Name of the model output for each role. In ssd, the roles are boxes, labels and scores. If ssd has no output for
+    scores, the fifth column of boxes has the scores. In detr, the roles are either boxes and logits, or predictions alone.
+    In every other layout, the only role is predictions."""
     names: Annotated[tuple[str, ...], Field(min_length=1)] | str | None = None
-    """Class names in the order of the model: a list, a file, coco (80 names) or coco91 (91 names with gaps). The file has
-    one name per line, or is YAML or JSON with the key `names`. A relative path may start from the folder of the settings
+    """Class names in the order of the model. It is a list, a file, coco (80 names) or coco91 (91 names with gaps). The file
+    has one name per line, or is YAML or JSON with the key `names`. A relative path may start from the folder of the settings
     file, the working folder or the folder of the model."""
     first_label: Annotated[int, Field(ge=0)] | None = None
-    """Class number of the first name. It is 1 if class 0 is the background and the names omit the background."""
+    """Class number that the model gives to the first name. It is 1 if class 0 is the background and the names omit the
+    background."""
     classes: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     """Names of the classes to keep. null keeps all classes."""
     min_score: Share = 0.25
     """Lowest score of a box that is kept."""
     iou: Share = 0.5
-    """Intersection over union above which non-maximum suppression drops the lower-scored of two boxes of one class."""
+    """Intersection over union of two boxes of one class above which non-maximum suppression drops the box with the lower
+    score."""
     nms: bool | None = None
     """Apply non-maximum suppression. null applies it to every YOLO layout except end_to_end."""
     max_boxes: Count = 300

@@ -9,12 +9,12 @@ from objslam.config.section import Count, Finite, NotNegative, Positive, Section
 
 
 class Encoder(Section):
-    """Configure the ONNX model that makes an appearance vector of each box (--embed). A setting of null is inferred from the
-    model's metadata or shapes. Else it has the value of most encoders, such as the normalisation of ImageNet. The model runs
-    on detector.device."""
+    """Configure the ONNX model that makes an appearance vector of each box (--embed). If a setting is null, its value comes
+    from the model's metadata or shapes. Otherwise, its value is that of most encoders, such as the normalisation of
+    ImageNet. The model runs on detector.device."""
 
     output: str | None = None
-    """Name of the model output with one vector per image, if several outputs could be that."""
+    """Name of the model output that has one vector per image. It is needed only if several outputs have such a shape."""
     size: tuple[Count, Count] | None = None
     """Width and height of the input in px, for a model that accepts any size. null uses 224 x 224."""
     colour: Colour | None = None
@@ -26,7 +26,7 @@ class Encoder(Section):
     std: tuple[Positive, Positive, Positive] | None = None
     """Standard deviation of each channel, in the channel order of the input. null uses the values of ImageNet."""
     margin: NotNegative = 0.0
-    """Part of the width and height of a box that is added on each side before the crop. A larger value shows more of the
-    surroundings, which helps only if objects do not move between them."""
+    """Margin that is added on each side of a box before the crop, as a share of the width and height of the box. A larger
+    value shows more of the surroundings. This helps only if objects do not move between different surroundings."""
     batch: Annotated[int, Field(ge=1, le=1024)] = 16
     """Number of crops per batch, for a model that accepts any batch size."""

@@ -1,4 +1,4 @@
-"""The ready settings of the package. `--config NAME` takes one by its name."""
+"""The ready settings of the package. `--config NAME` uses ready settings by their name."""
 
 import os
 from pathlib import Path
@@ -6,16 +6,17 @@ from pathlib import Path
 from objslam.config.settings import is_file
 from objslam.errors import ConfigError
 
-_FOLDER = Path(__file__).parent / "preset_files"  # In the sources it is a link to configs/ at the top.
+_FOLDER = Path(__file__).parent / "preset_files"  # In the repository, this folder is a link to configs/.
 
 
 def presets() -> dict[str, Path]:
-    """Return the file of each ready setting by its name."""
+    """Return the path of each file of ready settings, by the name of the settings."""
     return {file.stem: file for file in sorted(_FOLDER.glob("*.yaml"))}
 
 
 def find_config(given: Path) -> Path:
-    """Return the settings file that the user means: a file, or the name of ready settings. ConfigError if it is neither."""
+    """Return the path of the settings file that the user means. given: the path of a file, or the name of ready settings.
+    ConfigError if there is neither such a file nor such a name."""
     known = presets()
     if str(given) in known and not is_file(given):
         return known[str(given)]

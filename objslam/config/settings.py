@@ -19,15 +19,16 @@ from objslam.config.tags import Tags
 from objslam.config.yaml_text import MAX_YAML, parse_yaml
 from objslam.errors import ConfigError
 
-_SHOWN = 200  # The most letters of a wrong value in a message.
+_SHOWN = 200  # The largest number of characters of a wrong value that a message shows.
 
 
 class Settings(Section):
     """Hold all settings of a run."""
 
     mode: Literal["auto", "fixed", "joint"] = "auto"
-    """fixed: the objects are solved at the given poses. joint: poses and objects are solved together. auto: fixed for a log
-    with a localisation, else joint. fixed leaves the drift of odometry out of the covariances."""
+    """Which poses are solved. fixed: the objects are solved at the given poses. joint: poses and objects are solved
+    together. auto: joint if the log has no localisation, or if its localisation covers too few boxes or proves wrong, else
+    fixed. In fixed mode, the covariances do not contain the drift of odometry."""
     seed: Annotated[int, Field(ge=0)] = 0
     detector: Detector = Detector()
     encoder: Encoder = Encoder()
@@ -52,19 +53,19 @@ class Settings(Section):
 
     @property
     def finds_localization_noise(self) -> bool:
-        """Whether the size of the noise of localised poses is estimated. With `noise.localization=auto`, it is estimated if
-        `localization` has its default values."""
+        """Whether a run estimates the size of the noise of localised poses. With `noise.localization=auto`, a run estimates
+        this size if the section `localization` has its default values."""
         use, usual = self.noise.localization, self.localization == mapping.Localization()
         return usual if use == "auto" else use
 
 
 def load_settings(file: Path | None = None, overrides: tuple[str, ...] = ()) -> Settings:
-    """Load settings from a YAML file and from overrides. An override `key=value` has a dotted key and a YAML value, and
-    replaces a value of the file. A ConfigError names the file or the override, the key and the problem."""
+    """Return the settings from a YAML file and from overrides. An override `key=value` has a dotted key and a YAML value. It
+    replaces the value in the file. ConfigError names the file or the override, the key and the problem."""
     data: dict[str, Any] = {}
     if file is not None:
         data = _read_yaml(file)
-        # A relative names file beside the settings file is made absolute, so that any working directory finds it.
+        # If detector.names is the relative path of a file beside the settings file, it becomes an absolute path.
         names = _validate(data, str(file)).detector.names
         if isinstance(names, str) and is_file(file.parent / names):
             data["detector"]["names"] = str((file.parent / names).resolve())
@@ -81,8 +82,9 @@ def load_settings(file: Path | None = None, overrides: tuple[str, ...] = ()) -> 
 
 
 def change_settings(settings: Settings, changes: Mapping[str, Any]) -> Settings:
-    """Return settings with other values. A key is dotted, as "rays.pixel_sigma", or a section with a mapping of its values.
-    A ConfigError names the key and the problem."""
+    """Return the settings with changed values. changes: the new values by key. A key is dotted, such as "rays.pixel_sigma".
+    It may also name a section, and its value is then a mapping of keys in this section. ConfigError names the key and the
+    problem."""
     data = settings.model_dump(exclude_unset=True)
     _change(data, [], changes)
     return _validate(data, "settings")
@@ -161,7 +163,8 @@ def _short(value: Any) -> str:
 
 
 def _meant(key: str) -> str:
-    """Return the question whether the setting closest to a mistyped key is meant. Return an empty text if none is close."""
+    """Return a question for a message: whether the user meant the setting whose key is closest to a mistyped key. Return an
+    empty text if no key is close."""
     import difflib
 
     def names(section: type[BaseModel], prefix: str) -> Iterator[str]:

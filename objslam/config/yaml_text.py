@@ -1,12 +1,12 @@
-"""Parse YAML texts from outside. Any text that PyYAML cannot turn into plain data raises yaml.YAMLError."""
+"""Parse YAML texts of users. Any text that PyYAML cannot turn into plain data raises yaml.YAMLError."""
 
 from typing import Any
 
 import yaml
 
 MAX_YAML = 1 << 20
-"""The most characters of a YAML text. A longer text is not parsed, because PyYAML takes seconds for a megabyte. Settings
-need a few kB."""
+"""The maximum number of characters of a YAML text. A longer text is refused, because PyYAML takes seconds for a megabyte.
+Settings need a few kB. With a larger number, a large text takes more time."""
 
 
 def parse_yaml(text: str) -> Any:

@@ -1,4 +1,4 @@
-"""Run a CNN detector and an image encoder, any ONNX models, on the images of a log. Only this folder imports onnxruntime."""
+"""Run a CNN detector and an image encoder on the images of a log. Both are ONNX models, and only this folder runs them."""
 
 from objslam.detection.cache import default_cache
 from objslam.detection.detect_log import detect_log

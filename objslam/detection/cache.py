@@ -34,7 +34,7 @@ class DetectionCache:
 
     def __init__(self, folder: Path, key: str, ledger: Ledger) -> None:
         """Open the cache of the detector with this key. Damaged lines are dropped and counted. If the cache cannot be opened
-        or written, the ledger gets a warning and nothing more is written."""
+        or written, the ledger gets a warning, and the cache stores no further entries."""
         self._file = folder / f"{key}.jsonl"
         self._ledger = ledger
         self._lines: dict[str, bytes] = {}

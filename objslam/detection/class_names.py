@@ -1,5 +1,5 @@
-"""The class names of a model: from the settings, from the model's metadata, or from COCO if the number of classes
-matches."""
+"""Find the class names of a model. They come from the settings, from the model's metadata, or from COCO if the number of
+classes matches."""
 
 import ast
 import json
@@ -25,9 +25,11 @@ def is_background(name: str) -> bool:
 
 
 def names_from_settings(given: tuple[str, ...] | str | None, model: Path) -> tuple[str, ...] | None:
-    """Return the class names of the setting `detector.names`: a list, coco, coco91 or a file. A file is looked up as given,
-    then in the model's folder. Raises ConfigError if the file is missing or unreadable, or a name is empty or not
-    printable."""
+    """Return the class names of the setting `detector.names`, or None if it is not set.
+
+    given: the setting, which is a tuple of names, coco, coco91 or a file. A file is looked up as given, then in the folder
+    of the model. Raises ConfigError if the file is missing or unreadable, or if a name is empty or not printable.
+    """
     if given is None:
         return None
     if isinstance(given, tuple):
@@ -36,8 +38,9 @@ def names_from_settings(given: tuple[str, ...] | str | None, model: Path) -> tup
 
 
 def names_from_metadata(text: str | None, model: Path) -> tuple[str, ...] | None:
-    """Parse the names in a model's metadata, a list or dictionary in Python or JSON. Return None if there is no text.
-    Raises DetectorError if the text is something else, and ConfigError if a name is empty or not printable."""
+    """Return the class names in a model's metadata, or None if there is no text. text: a list, or a dictionary by class
+    number, written in Python or JSON. Raises DetectorError for any other text, and ConfigError if a name is empty or not
+    printable."""
     if not text:
         return None
     try:

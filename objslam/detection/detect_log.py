@@ -24,11 +24,11 @@ from objslam.io.text import read_bytes
 from objslam.io.threads import ahead
 
 _AHEAD = 8
-"""The number of images, in addition to a batch, that are decoded before the network needs them. A larger number needs more
-memory."""
+"""The number of images that are decoded before the network needs them, in addition to the images of a batch. A larger number
+needs more memory."""
 
 Progress = Callable[[str, int, int], None]
-"""A callback with the name of the stage, the number of finished items, and the total (0 if unknown)."""
+"""A callback that takes the name of the stage, the number of finished items, and the number of all items (0 if unknown)."""
 
 
 def detect_log(
@@ -42,9 +42,9 @@ def detect_log(
 ) -> Log:
     """Run the detector on the rgb images, and return the log with the boxes found. Cameras without rgb images are unchanged.
 
-    An image is dropped and counted if it cannot be read or decoded, or if its size is not the camera's. With `depth.use`, a
-    box gets its depth from a depth image if the camera has depth images. `cache` is the folder of the `DetectionCache`. None
-    uses no cache. Raises LogError if no image can be used, and DetectorError if the network fails.
+    An image is dropped and counted if it cannot be read or decoded, or if its size is not the camera's. If the setting
+    `depth.use` is True and the camera has depth images, each box gets its depth from a depth image. cache: the folder of the
+    `DetectionCache`, or None for no cache. Raises LogError if no image can be used, and DetectorError if the network fails.
     """
     total = sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None)
     if not total:
@@ -97,7 +97,7 @@ class Frame:
 
 
 def load_frame(path: Path, camera: Camera, cache: DetectionCache | None) -> Frame:
-    """Read an image file. If the cache has no boxes of it, decode it to 8 bit BGR without EXIF rotation."""
+    """Read an image file. If the cache has no boxes of the image, decode the image to 8-bit BGR without EXIF rotation."""
     try:
         data = read_bytes(path)
     except LogError as error:

@@ -34,7 +34,7 @@ class Boxes(NamedTuple):
 
 @dataclass(frozen=True)
 class Detector:
-    """A network with its recipe. batch: the largest number of images in one run. warnings: texts about the model."""
+    """A network with its recipe. batch: the largest number of images in one run. warnings: the warnings about the model."""
 
     network: Network
     recipe: Recipe
@@ -49,7 +49,7 @@ class Detector:
 
     def detect(self, images: Sequence[Array]) -> list[Boxes]:
         """Return the boxes of each image (H, W, 3), uint8, BGR. Raises ValueError if an image has another shape or type, and
-        DetectorError if the network fails or its outputs cannot be boxes."""
+        DetectorError if the network fails, or if its outputs cannot be decoded to boxes."""
         for image in images:
             if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
                 raise ValueError(f"an image must be (H, W, 3) uint8, got {image.shape} {image.dtype}")
@@ -63,15 +63,15 @@ class Detector:
         return results
 
     def prepare(self, images: Sequence[Array]) -> tuple[Array, Fit]:
-        """Return the network input for images of one size, at most `batch`, and the `Fit`: where the resized image lies in
-        the input."""
+        """Return the network input for at most `batch` images of one size, and their `Fit`. The `Fit` is the place of a
+        resized image in the input."""
         height, width = images[0].shape[:2]
         where = fit(self.recipe, width, height)
         return fill(self.recipe, images, where, self.network.image.batch or len(images)), where
 
     def read(self, outputs: Sequence[Array], where: Fit, count: int) -> list[Boxes]:
-        """Return the boxes of the first `count` images of a batch from the network's outputs. where: what `prepare`
-        returned."""
+        """Return the boxes of the first `count` images of a batch from the network's outputs. where: the `Fit` that
+        `prepare` returned."""
         named = _by_role(self.network, self.recipe, outputs)
         if not _has_batch(named):
             return [self._boxes(named, where)]

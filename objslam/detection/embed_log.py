@@ -1,4 +1,4 @@
-"""Appearance vectors in a log: an image encoder sees the crop of each box."""
+"""Add appearance vectors to the boxes of a log. An image encoder makes each vector from the crop of a box."""
 
 from dataclasses import replace
 from functools import partial
@@ -25,8 +25,8 @@ def embed_log(log: Log, encoder: Encoder, ledger: Ledger, progress: Progress = l
     log.
 
     The image of a frame is the nearest image in time, at most `MAX_IMAGE_LAG` (s) away. A frame without a usable image is
-    counted, and its boxes stay without a vector. Raises LogError if no frame has an image, and DetectorError if the network
-    fails.
+    counted as dropped, and its boxes get no vector. Raises LogError if no frame has an image, and DetectorError if the
+    network fails.
     """
     cameras, seen = [], 0
     for camera_log in log.cameras:

@@ -18,14 +18,17 @@ from objslam.errors import ConfigError, DetectorError
 DESCRIPTION = "objslam.encoder"
 """The metadata key of a model's own description, which is JSON with keys of the `encoder` settings."""
 _USER_ONLY = frozenset({"margin", "batch", "size"})
-_SIZE = 224  # The width and height, px, of an input of free size without a setting. Most encoders are trained with it.
+_SIZE = 224
+"""The width and height of the input, px, if neither the model nor the settings have a size. Most encoders are trained with
+this size."""
 _VECTOR_OUTPUTS = ("image_embeds", "image_features", "pooler_output", "embeddings", "embedding", "features")
-"""The names that exporters give to the output with the vector. The most reliable name is first."""
+"""The names that exporters give to the output with the vectors. The most reliable name is first."""
 
 
 @dataclass(frozen=True)
 class Encoder:
-    """A network with its recipe. output: the index of the output with the vectors. batch: the most crops in one run."""
+    """A network with its recipe. output: the index of the output with the vectors. batch: the most crops that one run
+    takes."""
 
     network: Network
     recipe: EncoderRecipe
@@ -33,8 +36,8 @@ class Encoder:
     batch: int
 
     def encode(self, image: Array, boxes: Floats) -> Array:
-        """Return a vector (N, D) for each box (N, 4) px of an image (H, W, 3), uint8, BGR. DetectorError if the network
-        fails."""
+        """Return the vectors (N, D) of boxes (N, 4) in an image (H, W, 3), uint8, BGR. boxes: x1, y1, x2, y2, px. Raises
+        DetectorError if the network fails."""
         crops = [_crop(image, box, self.recipe.margin) for box in boxes]
         found = [self._run(crops[at : at + self.batch]) for at in range(0, len(crops), self.batch)]
         return np.concatenate(found)
@@ -50,7 +53,7 @@ class Encoder:
 
 
 def load_encoder(model: Path, settings: config.Settings) -> Encoder:
-    """Load an ONNX image encoder, and run it once to see which of its outputs is one vector per image.
+    """Load an ONNX image encoder, and run it once to find the output with one vector per image.
 
     Raises DetectorError if the file is no ONNX model, needs other inputs than an image, cannot run, or has no such output.
     Raises ConfigError if the settings do not fit the model.
@@ -77,7 +80,11 @@ def load_encoder(model: Path, settings: config.Settings) -> Encoder:
 
 
 def _vector_output(network: Network, name: str | None, values: Sequence[Array], count: int) -> int:
-    """Return the index of the output that holds one vector for each of the `count` images."""
+    """Return the index of the output that holds one vector for each of the `count` images.
+
+    name: the setting encoder.output, or None. values: the outputs of one run. Raises ConfigError if the model has no output
+    of this name, and DetectorError if no output or several outputs fit.
+    """
     names = [tensor.name for tensor in network.outputs]
     if name is not None and name not in names:
         raise ConfigError(
@@ -102,7 +109,10 @@ def _vector_output(network: Network, name: str | None, values: Sequence[Array], 
 
 
 def _crop(image: Array, box: Floats, margin: float) -> Array:
-    """Return the part of an image in a box x1, y1, x2, y2 (px) and a margin, at least one pixel."""
+    """Return the part of an image inside a box with a margin. The part has at least one pixel.
+
+    box: x1, y1, x2, y2, px. margin: the margin on each side, as a share of the box's width or height.
+    """
     size = np.array([image.shape[1], image.shape[0]])
     more = margin * (box[2:] - box[:2])
     low = np.clip(np.floor(box[:2] - more), 0, size - 1).astype(int)

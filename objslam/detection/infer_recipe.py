@@ -1,5 +1,5 @@
-"""Inference of a model's recipe. The settings override the model's own description, and the description overrides the usual
-recipe of the layout."""
+"""Infer the recipe of a detector model. The settings override the model's own description, and the description overrides
+the usual recipe of the layout."""
 
 import json
 import re
@@ -24,13 +24,13 @@ _SIZE = 640  # The width and height of an input of free size, px, if the setting
 _LARGEST = 8192  # The largest width or height, px, that is accepted from the metadata. The limit bounds memory.
 _STRIDE = 32  # The stride of an input of free size, px, if the metadata has no stride.
 _PAD = 114  # The grey value of the padding if the settings have no value.
-_QUERIES = 300  # The number of queries of newer DETR models. DETR and its close variants have 100.
+_QUERIES = 300  # The least number of queries of newer DETR models. The original DETR and its close variants have 100.
 _UNNAMED = "the model names no classes: they are numbered (--names FILE names them)"
 
 
 def input_size(network: Network, settings: config.Detector) -> InputSize:
-    """Return the size of the network input. A side that the model leaves free has the size in the settings. Without this
-    size, it has the training size in the metadata, else 640 px. Raises ConfigError if the settings and the model differ."""
+    """Return the size of the network input. A side that the model leaves free has the length in the settings, else the
+    training size in the metadata, else 640 px. Raises ConfigError if the settings and the model differ."""
     image = network.image
     width, height = settings.size or _training_size(network.metadata) or (_SIZE, _SIZE)
     if settings.size is not None and (width, height) != (image.width or width, image.height or height):
@@ -49,8 +49,9 @@ def input_size(network: Network, settings: config.Detector) -> InputSize:
 def settle(
     network: Network, settings: config.Detector, size: InputSize, outputs: Sequence[Output]
 ) -> tuple[Recipe, str | None]:
-    """Infer the recipe from the outputs for an input of this size. Return the recipe, and a warning if class names are a
-    guess or missing. Raises ConfigError or DetectorError if the layout, the task, the settings or the names do not fit."""
+    """Return the recipe, inferred from the outputs for an input of this size, and a warning or None. The warning says that
+    the class names are a guess or missing. Raises ConfigError or DetectorError if the layout, the task, the settings or the
+    names do not fit."""
     task = network.metadata.get("task", "detect")
     if task in ("classify", "obb"):
         message = f"the model's task is {task}, which gives no axis-aligned boxes"
@@ -97,7 +98,7 @@ def settle(
 def _habits(
     layout: Layout, roles: Roles, named: Mapping[Role, Array], facts: Facts, *, free_size: bool, bytes_in: bool
 ) -> Habits:
-    """Return the usual properties of models of a layout. Some families of models differ: they get their own properties."""
+    """Return the usual properties of models of a layout. Some families of models get other properties."""
     habits = HABITS[layout]
     if layout == "ssd" and free_size:
         habits = replace(habits, resize="none")  # An ssd model of free size resizes the image itself.
@@ -132,8 +133,12 @@ def _is_tensorflow(roles: Roles) -> bool:
 def _fit_names(
     network: Network, known: tuple[str, ...] | None, channels: int | None, *, softmax: bool, exact: bool
 ) -> tuple[tuple[str, ...], str | None]:
-    """Return the class names, and a warning if they are a guess or missing. If the metadata has fewer names than the output
-    has channels, the further channels are no classes but masks or key points."""
+    """Return the class names, and a warning or None. The warning says that the names are a guess or missing. If the metadata
+    has fewer names than the output has channels, the other channels are masks or key points.
+
+    known: the names from the settings or the metadata. channels: the number of class scores per box. softmax: whether the
+    last class means "no object". exact: whether the number of names must fit. Raises ConfigError if it does not fit.
+    """
     if channels is None:
         return known or (), None if known else _UNNAMED
     room = channels - softmax
@@ -149,7 +154,8 @@ def _fit_names(
 
 
 def _taken(classes: tuple[str, ...] | None, names: tuple[str, ...], network: Network) -> tuple[int, ...] | None:
-    """Return the indices of the classes to keep, or None to keep all. Without `classes`, only the background is left out."""
+    """Return the indices of the classes to keep, or None to keep all. classes: the names of the classes to keep. If it is
+    None, only the background is left out."""
     if not names:
         numbers = [re.fullmatch("class_([0-9]{1,9})", name) for name in classes or ()]
         if not all(numbers):

@@ -1,4 +1,4 @@
-"""Read the description of itself that a model may have in its metadata: settings of a detector or of an encoder as JSON."""
+"""Read a model's own description from its metadata. The description is JSON with settings of a detector or an encoder."""
 
 import json
 from typing import TypeVar
@@ -11,10 +11,10 @@ Settings = TypeVar("Settings", bound=Section)
 
 
 def with_description(network: Network, settings: Settings, key: str, user_only: frozenset[str]) -> Settings:
-    """Return the settings, with unset values filled in from the model's own description, if its metadata has one.
+    """Return the settings, with unset values filled in from the model's own description.
 
-    key: of the description in the metadata. user_only: the settings that no model may describe. Raises DetectorError if the
-    description is invalid.
+    key: the metadata key of the description. Without this key, the settings are unchanged. user_only: the settings that no
+    model may describe. Raises DetectorError if the description is invalid.
     """
     text = network.metadata.get(key)
     if text is None:

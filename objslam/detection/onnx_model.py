@@ -1,7 +1,7 @@
-"""The network: an ONNX model in an onnxruntime session, with its inputs, outputs and metadata.
+"""Load and run a network. A network is an ONNX model in an onnxruntime session, with its inputs, outputs and metadata.
 
-A file of some kB can describe tensors of any size. The sizes of the image and of the outputs, and the memory of a run are
-therefore limited.
+A file of some kB can describe tensors of any size. Therefore, the size of the images, the size of the outputs and the memory
+of a run are limited.
 """
 
 import hashlib
@@ -30,25 +30,26 @@ _KINDS: dict[str, type[np.generic]] = {
 }
 _PIXELS = ("float", "float16", "double", "uint8")
 _MASK, _SIZES = "pixel_mask", "orig_target_sizes"
-_FED = {_MASK: 3, _SIZES: 2}  # The numbers of axes of the inputs that exported DETR models need besides the image.
-_NOT_A_MODEL = "INVALID_PROTOBUF"  # The error of onnxruntime for a file that is no ONNX model. Its text says no more.
+_FED = {_MASK: 3, _SIZES: 2}  # The inputs that exported DETR models need besides the image, with their numbers of axes.
+_NOT_A_MODEL = "INVALID_PROTOBUF"  # The error code of onnxruntime for a file that is no ONNX model.
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
-_GIB = 1 << 30  # bytes
+_GIB = 1 << 30  # The number of bytes in 1 GiB.
 _MOST_MEMORY = 8 * _GIB
 """The limit (bytes) of the main memory that all models of a process take together. On a computer with less than 16 GiB, the
 limit is half of its memory. A larger value allows larger models, but a damaged model can then take the memory from all other
 programs. YOLO12n with images of 640 px takes 0.1 GiB."""
 _MOST_PIXELS = 1 << 26
-"""The largest number of pixels of all images of a run, if the model fixes their size and number. It is the number of pixels
-of an image of 8192x8192. A larger value takes more memory before the model runs."""
+"""The largest number of pixels that the images of a run have together, if the model fixes their size and number. It is the
+number of pixels of an image of 8192x8192. A larger value takes more memory before the model runs."""
 _MOST_VALUES = 1 << 28
-"""The largest number of values of an output. A larger number takes more memory: float64 copies of this number of values take
-2 GiB. YOLO with 80 classes and an image of 8192x8192 has less than half of this number."""
+"""The largest number of values in an output. A larger number takes more memory. A float64 copy of an output of this size
+takes 2 GiB. The output of YOLO with 80 classes for an image of 8192x8192 is less than half as large."""
 
 
 @dataclass(frozen=True)
 class Tensor:
-    """The declaration of an input or output: its name, its shape (None for a free size), and the type of its values."""
+    """The declaration of an input or output. shape: the size of each axis, None for a free size. kind: the type of the
+    values, such as "float" or "uint8"."""
 
     name: str
     shape: tuple[int | None, ...]
@@ -60,8 +61,8 @@ class Tensor:
 
 @dataclass(frozen=True)
 class ImageInput:
-    """The layout of the image input, HWC if `channels_last` is True, else CHW. A size of None is free. A batch of 0 means
-    that the input has no batch axis."""
+    """The layout of the image input. If `channels_last` is True, an image is (H, W, 3), else (3, H, W). A batch, height or
+    width of None is free. A batch of 0 means that the input has no batch axis."""
 
     tensor: Tensor
     batch: int | None
@@ -111,8 +112,8 @@ class Network:
 
 def open_network(path: Path, settings: config.Detector) -> Network:
     """Load an ONNX model. The settings give the device and the number of threads. Raises DetectorError if the file is
-    missing or is no ONNX model, or if the model needs other inputs than an image, or a too large image. Raises ConfigError
-    if cuda is set but missing."""
+    missing or is no ONNX model, if the model needs inputs that an image does not give, or if it takes too large images.
+    Raises ConfigError if the device is cuda, but CUDA cannot be used."""
     import onnxruntime
 
     try:
@@ -128,7 +129,7 @@ def open_network(path: Path, settings: config.Detector) -> Network:
         options.add_session_config_entry("session.use_env_allocators", "1")
     providers = _providers(onnxruntime, settings.device)
     try:
-        # Without CUDA, the fallback of onnxruntime would only load the same file again, and print that.
+        # Without CUDA, the fallback of onnxruntime would only load the same file again, and print a message.
         session = onnxruntime.InferenceSession(str(path), options, providers=providers, enable_fallback=_CUDA in providers)
     except Exception as error:
         why = "" if _NOT_A_MODEL in str(error) else f": {first_line(error)}"
@@ -221,8 +222,8 @@ def _as_image(tensor: Tensor) -> ImageInput | None:
 
 
 def _extra(tensor: Tensor, count: int, height: int, width: int) -> Array:
-    """Return the value of an input besides the image, for `count` images. A pixel mask keeps the whole image. The model gets
-    the size of the network input as the size of the original image, so that its boxes are in px of the input."""
+    """Return the value of an input besides the image, for `count` images. A pixel mask keeps the whole image. The size of
+    the original image is set to the size of the network input, so that the model's boxes are in px of the input."""
     kind = _KINDS[tensor.kind]
     if tensor.name == _SIZES:
         return np.tile(np.array([width, height], dtype=kind), (count, 1))

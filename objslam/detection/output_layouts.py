@@ -1,4 +1,4 @@
-"""Recognition of the layout of a model's outputs from their shapes for one image and from the model's metadata."""
+"""Recognise the layout of a model's outputs. The evidence is the shapes of the outputs for one image, and the metadata."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from objslam.core.arrays import Array
 from objslam.errors import ConfigError, DetectorError
 
 STRIDES = (8, 16, 32)  # The strides in px of the three grids on which most YOLO models predict.
-_FEW = 1000  # The largest number of boxes of a network that itself selects boxes. A grid has thousands of boxes.
+_FEW = 1000  # The largest number of boxes from a network that selects its boxes itself. A grid has thousands of boxes.
 _ROLES: dict[Layout, tuple[frozenset[Role], ...]] = {
     "ssd": (frozenset({"boxes", "labels", "scores"}), frozenset({"boxes", "labels"})),
     "detr": (frozenset({"boxes", "logits"}), frozenset({"predictions"})),
@@ -21,7 +21,7 @@ _ROLES: dict[Layout, tuple[frozenset[Role], ...]] = {
 _SINGLE: tuple[frozenset[Role], ...] = (frozenset({"predictions"}),)
 
 Roles = Mapping[Role, str]
-"""The name of the model's output for each role, such as `boxes`."""
+"""The names of a model's outputs by their roles. A role is, for example, `boxes`."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Output:
 
 @dataclass(frozen=True)
 class Facts:
-    """The facts that distinguish layouts. height, width: the size of the input, px. classes: the number of class names, None
-    if unknown."""
+    """The facts that tell layouts with similar outputs apart. height, width: the size of the input, px. classes: the number
+    of class names, or None if it is unknown."""
 
     height: int
     width: int
@@ -55,8 +55,8 @@ class Facts:
 
 def recognise(outputs: Sequence[Output], settings: config.Detector, facts: Facts, model: Path) -> tuple[Layout, Roles]:
     """Return the layout and the output name of each role. The settings override the recognition. Raises ConfigError if the
-    settings name a missing output or roles that form no layout. Raises DetectorError if no layout fits the outputs. Its
-    message lists the outputs and says how to describe them."""
+    settings name a missing output, or roles that form no layout. Raises DetectorError if no layout fits the outputs. The
+    message of this error lists the outputs and says how to describe them."""
     layout = settings.layout
     roles: Roles | None = settings.outputs
     if roles is not None:
@@ -84,9 +84,9 @@ def recognise(outputs: Sequence[Output], settings: config.Detector, facts: Facts
 
 
 def rows_are_boxes(values: Array, classes: int | None) -> bool:
-    """Return whether each row of the predictions (..., A, B) is a box. If not, each column is a box, as in YOLOv8.
+    """Return whether each row of the predictions (..., A, B) is a box. If False, each column is a box, as in YOLOv8.
 
-    classes: the number of class names, None if unknown.
+    classes: the number of class names, or None if it is unknown.
     """
     rows, columns = values.shape[-2:]
     if classes is not None and (rows == 4 + classes) != (columns == 4 + classes):
@@ -151,8 +151,8 @@ def _detr_roles(outputs: Sequence[Output]) -> Roles | None:
 
 
 def _single(outputs: Sequence[Output]) -> Output | None:
-    """Return the only output with predictions, or None if there is not exactly one. Other outputs (masks, raw heads) are
-    allowed if they do not have a row for each box. If another output has a row for each box, return None."""
+    """Return the output with predictions. Return None if no output or several outputs have predictions, or if another output
+    has a row for each box. Other outputs, such as masks and raw heads, are ignored."""
     lists = [o for o in outputs if o.values.dtype.kind == "f" and (_is_numbered(o) or _is_list(o))]
     if len(lists) != 1:
         return None

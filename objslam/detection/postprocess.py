@@ -1,4 +1,4 @@
-"""Decoding of the outputs of one image to boxes, with one function per layout."""
+"""Decode the outputs for one image to boxes. Each layout has its own function."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,14 +11,16 @@ from objslam.detection.output_layouts import STRIDES
 from objslam.detection.recipe import Recipe
 from objslam.errors import DetectorError
 
-_FRACTION = 1.5  # Boxes are in fractions if no coordinate has a larger absolute value. Boxes in px are far larger.
-_CANDIDATES = 1000  # The most boxes of an image. The time of non-maximum suppression grows with the square of this number.
+_FRACTION = 1.5  # The largest absolute coordinate of boxes in fractions of the input. Boxes in px are far larger.
+_CANDIDATES = 1000
+"""The largest number of boxes that are kept for non-maximum suppression. The time of the suppression grows with the square
+of this number."""
 _Outputs = Mapping[Role, Array]
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Boxes (N, 4) with their scores (N,). label: (N,) the class numbers, or indices into the names."""
+    """The boxes (N, 4) that one image may have, with scores (N,). label: (N,) class numbers, or indices into the names."""
 
     boxes: Floats
     scores: Floats
@@ -26,9 +28,10 @@ class Candidates:
 
 
 def decode(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
-    """Decode and filter the boxes of one image. They are x1, y1, x2, y2 in px of the input, the highest score first. A label
-    is an index into the names, or a class number if there are no names. The outputs have no batch axis. Raises DetectorError
-    if a score is clearly above 1, a class has no name, or a class number is impossible."""
+    """Decode the boxes of one image, and return those that the settings keep, the highest score first. A box is x1, y1, x2,
+    y2 in px of the input. A label is an index into the names, or a class number if there are no names. outputs: the outputs
+    without a batch axis. width, height: the size of the input, px. Raises DetectorError if a score is clearly above 1, a
+    class has no name, or a class number is impossible."""
     found = _DECODERS[recipe.layout](recipe, outputs, width, height)
     boxes, scores = _corners(recipe, found.boxes, width, height), found.scores
     if len(scores) and scores.max() > 1.001:
@@ -47,8 +50,8 @@ def decode(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candid
 
 
 def suppress(boxes: Floats, scores: Floats, label: Ints, iou: float) -> Ints:
-    """Return the indices of the boxes (N, 4) that non-maximum suppression keeps, the best first. It removes a box whose IoU
-    with a better box of the same label is above `iou`."""
+    """Return the indices of the boxes (N, 4) that non-maximum suppression keeps, the best first. The suppression removes a
+    box whose IoU with a better box of the same label is above `iou`. boxes: x1, y1, x2, y2, px."""
     import cv2
 
     if len(boxes) == 0:
@@ -78,9 +81,10 @@ def _end_to_end(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> C
 
 
 def _check_classes(values: Array) -> None:
-    """Raise DetectorError if a class number is impossible, also in rows with a low score: then the column holds no classes.
+    """Raise DetectorError if a class number is impossible, because the column then does not hold classes.
 
-    values: (N,) class numbers. A row without a box may have -1 or a number that is not finite.
+    values: (N,) the class numbers of all rows, also of rows with a low score. A row without a box may have -1 or a number
+    that is not finite.
     """
     known = values[np.isfinite(values)].astype(np.float64)
     wrong = (known != np.rint(known)) | (known < -1)
@@ -133,14 +137,14 @@ _DECODERS: dict[Layout, Callable[[Recipe, _Outputs, int, int], Candidates]] = {
 
 
 def _likely(recipe: Recipe, rows: Array) -> tuple[Array, Ints]:
-    """Return the rows whose objectness (column 4) is at least `min_score`, and their indices. Only they need more work."""
+    """Return the rows whose objectness (column 4) is at least `min_score`, and their indices. The other rows give no box."""
     likely = np.flatnonzero(_probability(rows[:, 4], recipe) >= recipe.min_score)
     return rows[likely], likely
 
 
 def _best_class(recipe: Recipe, boxes: Array, values: Array, objectness: Array | None = None) -> Candidates:
     """Return the boxes whose best class has a score of at least `min_score`. values: (N, C) the outputs for the classes.
-    objectness: (N,) a factor of the scores, if any."""
+    objectness: (N,) the factors of the scores, or None."""
     values = values[:, : recipe.channels]
     if recipe.activation == "softmax":
         weights = np.exp(values - values.max(axis=1, keepdims=True))
@@ -179,7 +183,8 @@ def _corners(recipe: Recipe, boxes: Floats, width: int, height: int) -> Floats:
 
 
 def _name_indices(recipe: Recipe, label: Ints) -> Ints:
-    """Return the index in the names of each class number, -1 for background. Raises DetectorError if a class has no name."""
+    """Return the index into the names for each class number. Class numbers below the first name, such as the background, get
+    -1. Raises DetectorError if a class has no name."""
     indices = label - recipe.first_label
     beyond = indices >= len(recipe.names)
     if recipe.names and beyond.any():

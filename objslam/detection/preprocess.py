@@ -1,4 +1,4 @@
-"""Conversion of images to the size, colours and value range of the network input, and of boxes back to the image."""
+"""Convert images to the size, colours and value range of the network input, and convert boxes back to the raw image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ from objslam.errors import ConfigError
 
 @dataclass(frozen=True)
 class Fit:
-    """The place of the resized image in the network input, px. width, height: the size of the raw image. content_width,
-    content_height: the size of the resized image."""
+    """The place of the resized image in the network input, px. width, height: the size of the raw image. left, top: the
+    corner of the resized image in the input. content_width, content_height: the size of the resized image."""
 
     width: int
     height: int
@@ -32,8 +32,8 @@ class Fit:
 
 
 def fit(recipe: Recipe, width: int, height: int) -> Fit:
-    """Compute where a resized image lies in the input. width, height: of the raw image, px. Raises ConfigError if the recipe
-    does not resize and the model takes another size."""
+    """Return the place of the resized image in the network input. width, height: the size of the raw image, px. Raises
+    ConfigError if the recipe does not resize and the model takes another size."""
     size = recipe.size
     if recipe.resize == "none":
         if (width if size.free_width else size.width, height if size.free_height else size.height) != (width, height):
@@ -53,8 +53,8 @@ def fit(recipe: Recipe, width: int, height: int) -> Fit:
 
 
 def fill(recipe: Recipe | EncoderRecipe, images: Sequence[Array], where: Fit, count: int) -> Array:
-    """Convert images (H, W, 3), uint8 BGR, of one size to the network input (count, 3, H, W). If there are fewer images than
-    `count`, the rest of the input is grey."""
+    """Convert images (H, W, 3), uint8, BGR, of one size to the network input (count, 3, input height, input width). If there
+    are fewer images than `count`, the rest of the input is grey."""
     import cv2
 
     gain = 1.0 / (recipe.divide_by * np.array(recipe.std))

@@ -13,13 +13,14 @@ UNIT_STD: Three = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class Habits:
-    """The properties that models of a layout usually have. The settings and the model's own description override them."""
+    """The properties that models of a layout usually have. The settings and the model's own description override them. The
+    fields are explained in `config.detector.Detector`."""
 
     resize: Resize
     colour: Colour
     divide_by: float
     box_form: BoxForm
-    box_units: BoxUnits | None  # None infers the units from the values of the boxes.
+    box_units: BoxUnits | None  # The units of boxes. If None, the values of the boxes show the units.
     nms: bool
     activation: Activation = "none"
     mean: Three = NO_MEAN  # The mean of each channel after the division.
@@ -43,8 +44,8 @@ HABITS: dict[Layout, Habits] = {
 
 @dataclass(frozen=True)
 class InputSize:
-    """The size of the network input, px. For a free side, this is the largest length. The actual side is as long as the
-    resized image, rounded up to a multiple of `stride`."""
+    """The size of the network input, px. The length of a free side is its largest length. In a run, a free side has the
+    length of the resized image, rounded up to a multiple of `stride`."""
 
     width: int
     height: int
@@ -64,7 +65,7 @@ class Recipe(Habits):
     names: tuple[str, ...]  # The class names. The tuple is empty if the names are unknown.
     first_label: int  # The class number that the model gives to the first name.
     taken: tuple[int, ...] | None  # The indices into names (or class numbers) of the classes to keep. None keeps all.
-    channels: int | None  # The number of class scores per box that are read. None if the outputs have class numbers only.
+    channels: int | None  # The number of class scores that are read for a box. None if a box has only a class number.
     row_boxes: bool  # True if a row of the predictions is a box, False if a column is a box.
     min_score: float
     iou: float
@@ -77,7 +78,8 @@ class Recipe(Habits):
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderRecipe:
-    """The encoder settings of a model, with every value determined. A crop is stretched to width and height, px."""
+    """The encoder settings of a model, with every value determined. width, height: the size to which a crop is stretched,
+    px."""
 
     colour: Colour
     divide_by: float
@@ -85,5 +87,5 @@ class EncoderRecipe:
     std: Three
     width: int
     height: int
-    margin: float  # The part of a box's width and height that is added on each side.
+    margin: float  # The margin that is added to a box on each side, as a share of the box's width or height.
     pad: int = 0  # A stretched crop has no padding.

@@ -1,4 +1,4 @@
-"""How the calibration of each robot drifts over the days: one curve for each robot and shared error."""
+"""The drift of each robot's calibration over the days, as one curve for each robot and each shared error."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from objslam.core.arrays import Floats
 from objslam.fleet.driver import Mapped
 
 _MOST = 24
-"""The most curves of a page. A larger number also shows robots whose calibration changes less."""
+"""The maximum number of curves on a page. With a larger number, the page also shows smaller changes."""
 
 
 @dataclass(frozen=True)
 class Drift:
-    """The weighted mean of one shared error of one robot on each day.
+    """The weighted mean of one shared error of one robot on each of D days.
 
-    name: of the shared error. days: their names, in order. value, sigma: (D,) in `unit`. change: the value of the last day
-    minus the value of the first day, in standard deviations of this difference.
+    name: the name of the shared error. days: the names of the days, in order. value, sigma: (D,) the mean and its standard
+    deviation, in `unit`. change: the value of the last day minus the value of the first day, in standard deviations of this
+    difference.
     """
 
     robot: str
@@ -31,9 +32,10 @@ class Drift:
     change: float
 
     def curve(self, width: float, height: float) -> tuple[str, list[tuple[float, float, float, str]], float, float]:
-        """Return the curve in an SVG drawing of this size.
+        """Return the curve for an SVG drawing of the given width and height, in units of the drawing.
 
-        These are its path data, its points (x, y, half the error bar, text), and the ends of the vertical axis, in `unit`.
+        The values are the path data, the points, and the lower and the upper end of the vertical axis in `unit`. A point has
+        x, y, half the length of its error bar, and its text.
         """
         low, high = float((self.value - self.sigma).min()), float((self.value + self.sigma).max())
         span = max(high - low, 1e-12)
@@ -49,10 +51,10 @@ class Drift:
 
 
 def drifts(mapped: Sequence[Mapped]) -> list[Drift]:
-    """Return at most `_MOST` curves, the largest change first.
+    """Return at most `_MOST` curves. The curve with the largest change comes first.
 
-    There is a curve for each robot with a name and each error that its logs determine on two days or more. The value of a
-    day is the mean of its sessions, weighted by the inverse variances.
+    There is one curve for each pair of a named robot and an error that the robot's logs determine on at least two days. The
+    value of a day is the mean over the sessions of this day, weighted by the inverse variances.
     """
     found: dict[tuple[str, str, str], dict[str, list[tuple[float, float]]]] = {}
     for one in mapped:

@@ -1,4 +1,4 @@
-"""Drive a fleet: run the logs without a result on an engine, merge each site, and write the tables."""
+"""The driver of a fleet. It maps the logs without a result on an engine, merges each site, and writes the tables."""
 
 from __future__ import annotations
 
@@ -20,22 +20,25 @@ from objslam.fleet.tasks.site_task import Member, SiteResult, SiteTask
 from objslam.fleet.tree import MERGES, tree_of
 
 UNDATED = "undated"
-"""The day of a log if its path names no day, and its stamps are not Unix time."""
+"""The name of the day of a log whose path names no day and whose stamps are not Unix time."""
 _CHUNK = 500
-"""The number of records that are read at once. A larger number asks a store less often, and takes more memory."""
+"""The largest number of records that one call reads. With a larger number, there are fewer calls, and they take more
+memory."""
 
 Stage = Literal["mapping", "merging"]
 Tell = Callable[[Stage, int, int, int, int], None]
-"""A function that is called with the stage, and with four numbers: how many of its tasks succeeded, failed and are running,
-and how many there are."""
+"""A function that reports progress. Its first argument is the stage. The other four are numbers of tasks of this stage:
+succeeded, failed, running and all."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """The driver's summary of a mapped log.
+    """The summary of a mapped log.
 
-    key: the key of the result. begin: the first stamp of the path, s. warnings: the number of warnings. seconds: how long
-    the task took, s. report: whether the result has a report.html. new: whether this run mapped the log.
+    place: where the log was found. key: the key of the result. day: the name of the day. begin: the first stamp of the path,
+    s. objects, warnings: the numbers of objects and of warnings. verdict: good, check or bad. seconds: the duration of the
+    task, s. calibration: the shared errors. report: whether the result has a report.html. new: whether this run mapped the
+    log.
     """
 
     place: LogPlace
@@ -53,9 +56,11 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A log or a site that failed. name: the path of the log, or the site. place: where the log was found, None for a site.
+    """A log or a site that failed. name: the path of the log, or the name of the site. place: where the log was found, None
+    for a site.
 
-    kind: `log` if something is wrong with the log, `site` for a site, else the kind of the task's `Answer`.
+    kind: `log` if something is wrong with the log, `site` for a site. For any other failure, it is the kind of the task's
+    `Answer`.
     """
 
     name: str
@@ -66,9 +71,9 @@ class Failure:
 
 @dataclass
 class FleetResult:
-    """The outcome of the logs and the sites of a fleet. A run adds to it.
+    """The outcome of a run of a fleet: its logs, failures and sites. The run adds each entry when it is known.
 
-    copies: the number of mapped logs that have the same content as another log of their site. A merge takes one of them.
+    copies: the number of mapped logs that repeat the content of another log of their site. A merge uses each content once.
     """
 
     mapped: list[Mapped] = field(default_factory=list)
@@ -92,12 +97,15 @@ def run_fleet(
     tell: Tell = lambda stage, done, failed, running, total: None,
     merge_engine: Engine | None = None,
 ) -> FleetResult:
-    """Map the logs that have no result yet, merge each site, and write all tables.
+    """Map the logs that have no result yet, merge each site, and write all tables. Return the outcome.
 
     Args:
-        price: of an hour of one core, for the column cost; NaN if unknown.
-        again: whether logs that failed before because of their content are tried once more.
-        tell: a function that is called at the start of the mapping, and when a task ends.
+        job: the data that the tasks of all logs share.
+        logs: all logs of the run.
+        engine: the engine of the mapping.
+        price: the price of one hour of one core, for the column cost. NaN if unknown.
+        again: whether to try again the logs that failed before because of their content.
+        tell: a function that is called at the start of the mapping, and whenever a task ends.
         merge_engine: the engine of the merges, if they need other resources than the mapping. The default is `engine`.
     Raises:
         StoreError: the output cannot be read or written.
@@ -145,7 +153,7 @@ def _map_logs(
 
 
 def _read_records(store: Store, known: Sequence[tuple[LogPlace, str]]) -> Iterator[tuple[LogPlace, Record | None]]:
-    """Yield each log with the record of its key, None if the record is not there any more."""
+    """Yield each log with its record. The record is None if the store no longer has it. known: the logs with their keys."""
     for at in range(0, len(known), _CHUNK):
         part = known[at : at + _CHUNK]
         content = store.read_many(record_name(key) for _, key in part)
@@ -155,7 +163,7 @@ def _read_records(store: Store, known: Sequence[tuple[LogPlace, str]]) -> Iterat
 
 
 def _add(found: FleetResult, place: LogPlace, record: Record, *, new: bool) -> bool:
-    """Add a record to the result. Return whether its log failed."""
+    """Add the outcome of a record to `found`. Return whether the log of the record failed."""
     if record.error:
         found.failures.append(Failure(place.path, "log", record.error, place))
         return True
@@ -184,7 +192,10 @@ def _day(stamp: float) -> str:
 
 
 def _merge_sites(job: Job, engine: Engine, store: Store, price: float, found: FleetResult, tell: Tell) -> None:
-    """Merge the tree of each site level by level, all sites at once, and write the sites. Add them to `found`."""
+    """Merge the tree of each site, and write the folder and tables of each site. Add the outcome to `found`.
+
+    All sites are merged at the same time, level by level.
+    """
     here: dict[str, dict[str, Member]] = {}
     for one in found.mapped:
         member = Member(one.key, one.place.path, one.place.robot, one.day, one.begin, job.digest)
@@ -203,7 +214,8 @@ def _merge_sites(job: Job, engine: Engine, store: Store, price: float, found: Fl
     done = 0
 
     def run(work: str, tasks: dict[Any, str]) -> Iterator[Answer]:
-        """Run tasks, and yield their answers. tasks: the site of each task."""
+        """Run tasks on the engine, and yield their answers. work: the name of their function. tasks: the site of each
+        task."""
         nonlocal done
         for answer in engine(work, tasks):
             done += 1
@@ -231,10 +243,11 @@ def _merge_sites(job: Job, engine: Engine, store: Store, price: float, found: Fl
 
 
 def _with_earlier(members: dict[str, Member], state: bytes | None, digest: str, paths: set[str]) -> dict[str, Member]:
-    """Return the sessions of a site by key, in the order of time: `members`, and those of earlier runs with other logs.
+    """Return all sessions of a site by key, in the order of time: `members` of this run, and sessions of earlier runs.
 
-    state: the content of the file `state_name` of the site. digest: the hash of the job. paths: where the logs of
-    this run are, mapped or not. An earlier session with one of these paths is left out, because this run replaces it.
+    state: the content of the site's file `state_name`, None if there is no such file. digest: the hash of the job. paths:
+    the paths of all logs of this run, mapped or not. An earlier session whose path is in `paths` is left out, because this
+    run replaces it.
     """
     before = {one.key: one for one in site_task.earlier_members(state, digest) if one.path not in paths}
     return dict(sorted((before | members).items(), key=lambda entry: (entry[1].begin, entry[1].path)))

@@ -1,4 +1,5 @@
-"""Make the job that all logs of a fleet share, from the settings of the user and the files that they name."""
+"""Make the job that the tasks of all logs of a fleet share. It has the user's settings and the files that the settings
+name."""
 
 from __future__ import annotations
 
@@ -15,15 +16,16 @@ if TYPE_CHECKING:
     from objslam.sources import SourceOptions
 
 _INPUTS = "inputs"
-"""The folder, in a remote store, of the files that settings name."""
+"""The name of the folder in a remote store for the files that the settings name."""
 
 
 def make_job(store: str, settings: Settings, options: SourceOptions, detector: Path | None, *, report: bool) -> Job:
-    """Return the job of a fleet. If the store is remote, workers get the files of the settings through it.
+    """Return the job of a fleet. If the store is remote, copy the files that settings and options name into it. Workers read
+    these copies.
 
-    The key of the results depends on the content of the files that settings and options name, and not on their paths. store:
-    the path or URL of the output. detector: the file of a model. report: whether each log gets a report.html. ConfigError if
-    a file cannot be read, StoreError if the store cannot be read or written.
+    The digest of the job depends on the content of the files, and not on their paths. store: the path or URL of the output.
+    detector: the path of a model file. report: whether each log gets a report.html. ConfigError if a file cannot be read,
+    StoreError if the store cannot be read or written.
     """
     files: dict[str, Path] = {}
     if settings.calibration.file is not None:
@@ -48,7 +50,8 @@ def make_job(store: str, settings: Settings, options: SourceOptions, detector: P
 
 
 def _placed(store: str, file: Path, content: bytes) -> str:
-    """Return where workers find a file: its path, or its name in a remote store."""
+    """Return the path at which workers find a file. If the store is remote, write the file into it, and return its name
+    there."""
     if not is_remote(store):
         return str(file.resolve())
     name = f"{_INPUTS}/{key_of(content.hex())}/{file.name}"

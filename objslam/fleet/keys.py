@@ -19,15 +19,16 @@ if TYPE_CHECKING:
     from objslam.sources import SourceOptions
 
 OPTION_FILES = ("class_names", "camera_info")
-"""The options of a source that may name a file."""
+"""The names of those options of a source whose value may be the path of a file."""
 _LETTERS = 32
-"""The hexadecimal digits of a key. A larger number makes longer names. With 32, two contents never have one key by
-chance."""
-_BLOCK = 1 << 20  # The bytes that are read at once. A larger number needs more memory.
+"""The number of hexadecimal digits of a key. With 32 digits, two contents never have the same key by chance. A larger number
+makes longer names."""
+_BLOCK = 1 << 20  # The number of bytes in one read of a file. A larger number needs more memory.
 
 
 def hash_log(path: Path) -> str:
-    """Return the hash of a log. It covers the relative names and the bytes of all files. OSError from the disk."""
+    """Return the hash of a log. It covers the relative names and the bytes of all its files. OSError if a file cannot be
+    read."""
     digest = sha256()
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     for file in files:
@@ -39,10 +40,11 @@ def hash_log(path: Path) -> str:
 
 
 def hash_settings(settings: Settings, options: SourceOptions, files: Mapping[str, bytes]) -> str:
-    """Return the hash of all that decides a result besides its log: settings, options of the source, version and `files`.
+    """Return the hash of everything that a result depends on, except the log: settings, source options, version and `files`.
 
-    files: the content of each file by its key. The key is the dotted key of the setting that names the file, the name of the
-    option that does, or "detector". The path of a file does not count.
+    files: the content of each file by key. If a setting names the file, the key is the dotted key of this setting. If an
+    option names the file, the key is the name of this option. The key of the model is "detector". The path of a file does
+    not change the hash.
     """
     values = change_settings(settings, dict.fromkeys((key for key in files if "." in key), "a file")).model_dump(mode="json")
     said: dict[str, Any] = {"version": __version__, "settings": values}
@@ -54,7 +56,7 @@ def hash_settings(settings: Settings, options: SourceOptions, files: Mapping[str
 
 
 def key_of(*parts: str) -> str:
-    """Return the key of texts: the first digits of the hash of the texts, in their order."""
+    """Return the key of several texts. It is the first `_LETTERS` digits of the hash of the texts in the given order."""
     return sha256("\0".join(parts).encode()).hexdigest()[:_LETTERS]
 
 

@@ -1,4 +1,4 @@
-"""Find the logs that the sources of a fleet name, and the site, the robot and the day of each."""
+"""Find the logs in the sources of a fleet, and the site, the robot and the day of each log."""
 
 from __future__ import annotations
 
@@ -13,21 +13,23 @@ from objslam.fleet.stores.store import FileState
 from objslam.sources import SOURCES
 
 DEFAULT_LAYOUT = "{site}/{log}"
-"""The default of --layout: the folder that holds a log is its site."""
+"""The default of --layout. With it, the site of a log is the name of the folder that contains the log."""
 NO_SITE = "all"
-"""The name of the only site with --by none. With --by folder, it is the site of a log that lies in no folder."""
+"""The name of the only site with --by none. With --by folder, it is the site of a log whose path names no folder."""
 _LOG_MARKS = {mark for source in SOURCES for mark in source.marks}
-"""Names that make a folder a log."""
+"""The names of files and folders that mark a log. A folder that contains such a name is a log."""
 _BAGS = (".bag", ".mcap", ".db3")
-"""The endings of ROS bags. Each may be followed by .zstd or .zst."""
+"""The endings of the file names of ROS bags. Each may be followed by .zstd or .zst."""
 _BAG_FOLDER = "metadata.yaml"
-"""If a folder with bags has this file of rosbag2, it is one log: all its bags belong to one recording."""
+"""The name of the file that rosbag2 writes into the folder of a recording. A folder with this file and bags is one log,
+because all its bags belong to one recording."""
 
 
 @dataclass(frozen=True, slots=True)
 class LogPlace:
-    """A log that was found. path: a path or URL. size: bytes. fingerprint: the hash of its path, and of the name, the size
-    and the stamp (`FileState`) of each file. site, robot, day: empty if the layout does not say."""
+    """A log that was found. path: its path or URL. size: the size of all its files, bytes. fingerprint: a hash of the path
+    of the log and of the name, the size and the stamp (`FileState`) of each file. site, robot, day: the names of its site,
+    robot and day. The names of robot and day are empty if the layout does not give them."""
 
     path: str
     size: int
@@ -38,10 +40,12 @@ class LogPlace:
 
 
 class Layout:
-    """The folders above a log, as "{site}/{robot}/{day}/{log}". Each {name} is one part of a path."""
+    """A description of the folders above a log, such as "{site}/{robot}/{day}/{log}". Each {name} is a field, whose value is
+    read from the path of a log."""
 
     def __init__(self, template: str, by: str) -> None:
-        """by: what names the site: a field of the layout, `folder` for the folder of the log, or `none` for one site of all.
+        """template: the description. by: what gives a log its site. It is a field of the layout, `folder` for the name of
+        the folder that contains the log, or `none` for one site for all logs.
 
         ConfigError for a wrong template or field.
         """
@@ -61,10 +65,10 @@ class Layout:
         self._template, self._by = template, by
 
     def fields(self, path: str) -> tuple[str, str, str]:
-        """Return the site, the robot and the day of a log.
+        """Return the names of the site, the robot and the day of a log. path: the path or URL of the log.
 
-        If a path does not fit the layout, its robot and day are empty with --by folder or none. With a field of the layout,
-        this is a ConfigError.
+        If the path does not fit the layout and --by is folder or none, the names of robot and day are empty. ConfigError if
+        the path does not fit the layout and --by is a field of the layout.
         """
         parts = [part for part in path.partition("://")[2 if "://" in path else 0].split("/") if part]
         tail = parts[-len(self._parts) :]
@@ -90,11 +94,12 @@ class Layout:
 
 
 def find_logs(sources: Sequence[str], layout: Layout) -> list[LogPlace]:
-    """Return the logs that paths, glob patterns and URLs name, each once, in order.
+    """Return the logs that the sources name, each log once, in the order of their paths. sources: paths, glob patterns and
+    URLs.
 
-    A folder that is no log is searched. A named path without a log counts as a log, so that its run says what is wrong with
-    it. Of the files that a pattern names, only bags count. LogError if a source names nothing, ConfigError if a path does
-    not fit the layout.
+    If a path is a folder but no log, its inner folders are searched. If no log is found there, the path itself counts as a
+    log. The task of this log then says what is wrong. Files that a pattern names count only if they are bags. LogError if a
+    source names nothing, ConfigError if a path does not fit the layout.
     """
     found: dict[str, LogPlace] = {}
     for source in sources:
@@ -113,9 +118,10 @@ def find_logs(sources: Sequence[str], layout: Layout) -> list[LogPlace]:
 
 
 def _split(files: Mapping[str, FileState]) -> Iterator[tuple[str, dict[str, FileState]]]:
-    """Yield the relative path of each log among files, with the files of the log. If there is none, all files are one log.
+    """Yield the relative path of each log among files, with the files of the log by their names relative to the log.
 
-    A log inside another log is a part of the outer one.
+    files: the files below one path, by their relative names. If no log is among them, all files together count as one log. A
+    log inside another log is a part of the outer log.
     """
     names: dict[str, set[str]] = {}
     for name in files:

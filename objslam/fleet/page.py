@@ -1,6 +1,6 @@
-"""fleet.html: the sites, the failures, the drift of each robot's calibration, and links to the results.
+"""The page fleet.html. It shows the sites, the failures, the drift of each robot's calibration, and links to the results.
 
-The page needs no network. Texts from logs are escaped, because strangers chose the names in them.
+The page needs no network. It escapes texts from logs, because anybody may have chosen the names in them.
 """
 
 from __future__ import annotations
@@ -21,15 +21,16 @@ from objslam.io.results.files import OBJECTS, PICTURE, REPORT, SUMMARY
 PAGE = "fleet.html"
 """The name of the page in the store."""
 _FAILURES = 500
-"""The most failures on the page. failed.parquet has all of them."""
+"""The maximum number of failures on the page. A larger number makes the page longer. failed.parquet has all failures."""
 _SESSIONS = 1000
-"""The most sessions on the page. Bad verdicts come first, then check, then good, each with the newest first.
-sessions.parquet has all of them."""
+"""The maximum number of sessions on the page. Sessions with the verdict bad come first, then check, then good. Among
+sessions with the same verdict, the newest comes first. A larger number makes the page longer. sessions.parquet has all
+sessions."""
 _WIDTH, _HEIGHT = 100.0, 36.0  # The size of a curve, in units of its drawing.
 
 
 def fleet_page(found: FleetResult, *, price: float) -> bytes:
-    """Return the page of a fleet. price: of an hour of one core, NaN if unknown."""
+    """Return the content of the page of a fleet. price: the price of one hour of one core, NaN if unknown."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -65,14 +66,14 @@ def fleet_page(found: FleetResult, *, price: float) -> bytes:
 
 
 def duration(hours: float) -> str:
-    """Return a time in the unit that suits it, such as 15 s, 4.2 min or 31.50 h."""
+    """Return a duration as text, in s, min or h, such as 15 s, 4.2 min or 31.50 h. hours: the duration, h."""
     if hours >= 1:
         return f"{hours:.2f} h"
     return f"{60 * hours:.1f} min" if hours >= 1 / 60 else f"{3600 * hours:.0f} s"
 
 
 def _told(mapped: Sequence[Mapped]) -> dict[str, object]:
-    """Return a part of a site's row in the table of sites: the columns that its sessions in this run give."""
+    """Return one site's values in the table of sites, by column. They come from the sessions of the site in this run."""
     days = sorted({one.day for one in mapped})
     return {
         "robots": len({one.place.robot for one in mapped} - {""}),
@@ -83,7 +84,7 @@ def _told(mapped: Sequence[Mapped]) -> dict[str, object]:
 
 
 def _chosen(mapped: Sequence[Mapped]) -> list[Mapped]:
-    """Return the sessions that the page lists, as `_SESSIONS` says."""
+    """Return the sessions that the page lists. Their number and order are those of `_SESSIONS`."""
     return sorted(mapped, key=lambda one: ("bad", "check", "good").index(one.verdict) * 1e12 - one.begin)[:_SESSIONS]
 
 

@@ -1,4 +1,5 @@
-"""The record of a log: what a fleet keeps of one run besides the result. It is written last, and marks a whole result."""
+"""The record of a log. It contains what a fleet keeps of one run besides the result. It is written after the result, so it
+shows that the result is complete."""
 
 from __future__ import annotations
 
@@ -11,12 +12,14 @@ from objslam.fleet.stores.store import StoreError
 from objslam.io.results.files import dump_json
 
 RESULTS, RECORDS, SEEN = "results", "records", "seen"
-"""The three folders of a fleet. They hold the results by key, their records, and the empty files that `seen_name` names."""
+"""The names of three folders in the store. These folders contain the results by key, the records of the logs, and the empty
+files that `seen_name` names."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A shared error that a run estimated. value, sigma: in `unit`. known: whether the log determines the error."""
+    """One shared error that a run estimated. value, sigma: the estimate and its standard deviation, in `unit`. known:
+    whether the log determines the error."""
 
     name: str
     value: float
@@ -29,10 +32,11 @@ class Parameter:
 class Record:
     """The outcome of one log.
 
-    key: of the content, the settings and the version. source: the path or URL of the log. log: the hash of its content.
-    settings: the digest of the job. error: what is wrong with the log, empty if it was mapped. begin, end: the first and the
-    last stamp of the path, s. verdict: good, check or bad. cpu, seconds: the processor time and the duration of the task, s.
-    memory: the most RAM that its process had so far, bytes. size: of the result, bytes. files: the names in the result.
+    key: the hash of the content of the log, the job and the version. source: the path or URL of the log. log: the hash of
+    the content of the log. settings: the digest of the job. error: what is wrong with the log, empty if it was mapped.
+    begin, end: the first and the last stamp of the path, s. verdict: good, check or bad. cpu, seconds: the processor time
+    and the duration of the task, s. memory: the peak RAM of the task's process since the process started, bytes. size: the
+    size of the result, bytes. files: the names of the files in the result.
     """
 
     key: str
@@ -60,7 +64,8 @@ class Record:
 
     @classmethod
     def parse(cls, data: bytes, where: str) -> Self:
-        """Return the record from the content of its file. StoreError, with the name `where`, if it is damaged."""
+        """Return the record in the content of a file. where: the name of the file for messages. StoreError if the content is
+        damaged."""
         try:
             said: dict[str, Any] = json.loads(data)
             said["calibration"] = tuple(Parameter(**one) for one in said["calibration"])
@@ -71,25 +76,27 @@ class Record:
 
 
 def record_name(key: str) -> str:
-    """Return the name of a record in the store. key: the key of its log."""
+    """Return the name of the file of a record in the store. key: the key of the record."""
     return f"{RECORDS}/{key}.json"
 
 
 def result_name(key: str) -> str:
-    """Return the folder of a result in the store. key: the key of its log."""
+    """Return the name of the folder of a result in the store. key: the key of the result."""
     return f"{RESULTS}/{key}"
 
 
 def seen_name(task: str, key: str, good: bool) -> str:
-    """Return the name of an empty file. The name says which key a log has, and whether the log was mapped (`good`).
+    """Return the name of an empty file in the store. The name says which key a log has, and whether the log was mapped
+    (`good`).
 
-    task: the key of the log's fingerprint and the job, which is known before the log is read.
+    task: the key of the log's fingerprint and the job. Unlike `key`, it is known before the log is read.
     """
     return f"{SEEN}/{task}.{key}.{'done' if good else 'failed'}"
 
 
 def parse_seen(names: list[str]) -> dict[str, tuple[str, bool]]:
-    """Return the key of each task, and whether its log was mapped, from the names of the files in the folder `SEEN`."""
+    """Return for each task the key of its log, and whether the log was mapped. names: the names of the files in the folder
+    `SEEN`."""
     found: dict[str, tuple[str, bool]] = {}
     for name in names:
         task, _, rest = name.partition(".")

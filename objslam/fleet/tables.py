@@ -1,7 +1,8 @@
-"""The tables of a fleet: sessions, objects and failures, as Parquet files that DuckDB, pandas, QGIS and Spark read.
+"""The tables of a fleet: sessions, objects and failures. They are Parquet files, which DuckDB, pandas, QGIS and Spark can
+read.
 
-The objects are GeoParquet 1.1 points (https://geoparquet.org/releases/v1.1.0/) in the metric frame of their site, which has
-no coordinate reference system.
+The objects are GeoParquet 1.1 points (https://geoparquet.org/releases/v1.1.0/). They are in the metric frame of their site,
+which has no coordinate reference system.
 """
 
 from __future__ import annotations
@@ -21,14 +22,15 @@ if TYPE_CHECKING:
 
     from objslam.core.arrays import Floats
 
-_POINT_Z = 1001  # The number of a 3D point in the ISO form of well-known binary.
-_WKB = np.dtype([("order", "u1"), ("kind", "<u4"), ("place", "<f8", 3)])  # One point, little endian.
+_POINT_Z = 1001  # The code of a 3D point in the ISO form of well-known binary.
+_WKB = np.dtype([("order", "u1"), ("kind", "<u4"), ("place", "<f8", 3)])  # The layout of one point, little endian.
 
 
 def session_schema() -> pa.Schema:
-    """Return the columns of the table of sessions.
+    """Return the schema of the table of sessions.
 
-    Stamps, seconds and cpu are in s, memory and size in bytes, x, y and z in m, yaw in rad, cost in the unit of the price.
+    Stamps, seconds and cpu are in s, memory and size in bytes, x, y and z in m, and yaw in rad. cost is in the currency of
+    the price.
     """
     import pyarrow as pa
 
@@ -52,10 +54,11 @@ def session_schema() -> pa.Schema:
 def session_row(
     record: Record, robot: str, island: int, pose: Floats, odds: float, common: int, price: float
 ) -> dict[str, Any]:
-    """Return the row of a session.
+    """Return the row of a session in the table of sessions.
 
-    island: the number, from 1 on, of its group of sessions with objects in common. pose: (4, 4) of the session in the frame
-    of its island, m. odds, common: the `log_odds` and `common` of `Placed`. price: of an hour of one core, NaN if unknown.
+    robot: the name of the robot. island: the number, from 1 on, of the session's group of sessions that share objects. pose:
+    (4, 4) the pose of the session in the frame of this group, m. odds, common: the `log_odds` and `common` of `Placed`.
+    price: the price of one hour of one core, NaN if unknown.
     """
     counts = record.counts or {}
     return {
@@ -73,7 +76,8 @@ def session_row(
 
 
 def object_rows(objects: Iterable[MapObject], frame_T_map: Floats, more: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a row for each object, moved by frame_T_map (4, 4). more: columns that all rows share."""
+    """Return one row for each object, with the object moved to another frame. frame_T_map: (4, 4) takes points from the map
+    of the objects to this frame. more: the columns that all rows share."""
     turn, rows = frame_T_map[:3, :3], []
     for o in objects:
         row = {**more, **o.row()}
@@ -90,16 +94,16 @@ def object_rows(objects: Iterable[MapObject], frame_T_map: Floats, more: dict[st
 
 
 def dump_sessions(rows: Sequence[dict[str, Any]]) -> bytes:
-    """Return the content of a file of sessions."""
+    """Return the content of a Parquet file with the rows of sessions."""
     import pyarrow as pa
 
     return _parquet(pa.Table.from_pylist(list(rows), session_schema()))
 
 
 def dump_objects(rows: Sequence[dict[str, Any]], *, lives: bool = False) -> bytes:
-    """Return the content of a GeoParquet file of objects. The geometry of an unresolved object is null.
+    """Return the content of a GeoParquet file with the rows of objects. The geometry of an unresolved object is null.
 
-    lives: whether the objects are of a site. Such objects have no columns session, source and robot.
+    lives: whether the objects are those of a merged site. Their rows have no columns session, source and robot.
     """
     import pyarrow as pa
 
@@ -118,7 +122,7 @@ def dump_objects(rows: Sequence[dict[str, Any]], *, lives: bool = False) -> byte
 
 
 def dump_failures(rows: Sequence[dict[str, Any]]) -> bytes:
-    """Return the content of failed.parquet: source, site, robot, day, kind and error."""
+    """Return the content of failed.parquet, with the columns source, site, robot, day, kind and error."""
     import pyarrow as pa
 
     names = ("source", "site", "robot", "day", "kind", "error")

@@ -1,7 +1,8 @@
-"""The merge of a site as a tree: groups of sessions, pairs of groups, pairs of pairs.
+"""The tree in which the sessions of a site are merged. Its nodes are groups of sessions, then pairs of groups, then pairs of
+such pairs.
 
-The sessions are in the order of time. The key of a node is a hash of the keys below it. So when sessions are added at the
-end, only the nodes on the way from them to the root are new. The other nodes are not merged again.
+The sessions are in the order of time. The key of a node is a hash of the keys below it. If sessions are added at the end,
+only the nodes between the added sessions and the root get new keys. All other nodes are not merged again.
 """
 
 from __future__ import annotations
@@ -13,15 +14,15 @@ from objslam import __version__
 from objslam.fleet.keys import key_of
 
 LEAF = 4
-"""The most sessions of one group. A larger number makes fewer tasks, and each of them longer."""
+"""The largest number of sessions in one group. With a larger number, there are fewer tasks, and each task takes longer."""
 MERGES = "merges"
-"""The folder of the nodes in the store."""
+"""The name of the folder of the nodes in the store."""
 
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A node of the tree. sessions: the keys of all sessions below it, in order. below: the keys of its two parts, none for
-    a group of sessions."""
+    """A node of the tree. sessions: the keys of all sessions below the node, in the order of time. below: the keys of the
+    two nodes that it joins, empty for a group of sessions."""
 
     key: str
     sessions: tuple[str, ...]
@@ -29,10 +30,10 @@ class Node:
 
 
 def tree_of(sessions: Sequence[str]) -> list[list[Node]]:
-    """Return the nodes of a site, level by level. The last level is the root alone. A node without a partner is also in the
-    next level.
+    """Return the nodes of a site, level by level. The first level has the groups. The last level has only the root. A node
+    without a partner is also in the next level.
 
-    sessions: the keys of the results, one at least, in the order of time.
+    sessions: the keys of at least one result, in the order of time.
     """
     groups = [tuple(sessions[at : at + LEAF]) for at in range(0, len(sessions), LEAF)]
     levels = [[Node(key_of("leaf", __version__, *group), group) for group in groups]]
@@ -44,7 +45,7 @@ def tree_of(sessions: Sequence[str]) -> list[list[Node]]:
 
 
 def node_name(key: str) -> str:
-    """Return the name of a node in the store."""
+    """Return the name of a node's file in the store. key: the key of the node."""
     return f"{MERGES}/{key}.json"
 
 

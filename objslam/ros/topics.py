@@ -1,4 +1,4 @@
-"""Assign roles to topics: the known roles, the choices of the user, and hints in topic names."""
+"""Name the roles of topics, parse the topics that the user chose, and find hints in topic names."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -9,10 +9,11 @@ from objslam.errors import ConfigError
 from objslam.io.camera_yaml import Mount
 
 ROLES = ("odometry", "localization", "detections", "image", "depth", "camera_info")  # The roles of topics in a bag.
-TF, NONE = "tf", "none"  # Words for --topic in place of a topic. TF: transforms supply the role. NONE: nothing does.
-TF_ROLES = ("tf", "tf_static")  # The roles of the topics of transforms.
+TF, NONE = "tf", "none"
+"""The words that --topic accepts in place of a topic. TF: transforms supply the role. NONE: nothing supplies the role."""
+TF_ROLES = ("tf", "tf_static")  # The roles of the topics that carry transforms.
 FROM_TF = ("odometry", "localization")  # The roles that transforms can supply.
-LISTED = 8  # The limit of topics listed in a message. The limit keeps the message readable.
+LISTED = 8  # The largest number of topics that a warning lists. The limit keeps the warning readable.
 
 
 @dataclass(frozen=True)
@@ -22,15 +23,15 @@ class Choices:
     names: dict[tuple[str, str], list[str]] = field(default_factory=dict)
 
     def of(self, role: str, camera: str = "") -> list[str]:
-        """Return the topics chosen for a role of `camera`. Without any, return the topics chosen for any camera."""
+        """Return the topics chosen for a role of `camera`. If none were chosen, return those chosen for any camera."""
         return self.names.get((camera, role)) or self.names.get(("", role)) or []
 
 
 def parse_topics(texts: Sequence[str], *, live: bool = False) -> Choices:
     """Parse the values of --topic. Raises ConfigError for a wrong value.
 
-    A value is "role=/topic", or for a bag also "camera.role=/topic". With `live`, a value names no camera, and a topic may
-    lack its "/".
+    A value is "role=/topic", or for a bag also "camera.role=/topic". If `live` is True, a value must not name a camera, and
+    a topic may lack its leading "/".
     """
     choices, roles = Choices(), (*ROLES, *TF_ROLES)
     for text in texts:
@@ -69,11 +70,14 @@ def closeness(a: str, b: str) -> int:
 
 
 def mount_of(mounts: Sequence[Mount], frame: str, topic: str) -> Mount | None:
-    """Return the mount of the camera with a frame and a topic. A single mount without a name fits every camera."""
+    """Return the mount of the camera that has this coordinate frame and topic, or None if no mount fits.
+
+    A single mount without a name fits every camera.
+    """
     named = (mount for mount in mounts if mount.name and is_named(mount.name, frame, topic))
     return next(named, mounts[0] if len(mounts) == 1 and not mounts[0].name else None)
 
 
 def is_named(camera: str, frame: str, topic: str) -> bool:
-    """Return whether a camera name equals a coordinate frame, or a part between slashes of the frame or of a topic name."""
+    """Return whether a camera name equals a frame name, or a part between slashes of the frame name or of a topic name."""
     return camera in (frame, *frame.split("/"), *topic.split("/"))

@@ -1,5 +1,5 @@
 """Simulate drives of a robot among objects in a room, with the errors of real logs and with ground truth. The path, the
-objects and each noise have their own random generators, so a change of one noise leaves the others unchanged.
+objects and each kind of error have their own random generators, so a change of one error leaves the others unchanged.
 """
 
 from dataclasses import replace

@@ -13,18 +13,18 @@ from objslam.core.types import Detections
 from objslam.frontend.surface_ranges import half_widths, to_centres
 from objslam.simulation.settings import AppearanceNoise, DriveSettings
 
-FALSE_SIZES = (20.0, 120.0)  # The least and largest side of a false box, px.
-_MOST_NOISE = 20.0  # The largest tried noise of an appearance vector, in lengths of the vector.
-_HALVINGS = 30  # The number of halvings of the range of tried noise. A larger number is more exact.
+FALSE_SIZES = (20.0, 120.0)  # The least and the largest side length of a false box, px.
+_MOST_NOISE = 20.0  # The largest noise of an appearance vector that is tried, as a multiple of the vector's length.
+_HALVINGS = 30  # How often the search for the noise halves its range. With a larger number, the noise is more exact.
 TRACK_PATIENCE = 1.0  # The time without a box after which a tracker loses an object, s.
 
 
 @dataclass(frozen=True)
 class Views:
-    """The M views of objects in all images of a camera, without errors.
+    """The M views of objects in all images of a camera, without errors. A view is one object in one image.
 
     frame: (M,) the index of the image. object: (M,) the index of the object. centre, size: (M, 2) centre and size of the
-    box, px. depth: (M,) z, m.
+    box, px. depth: (M,) z of the object's centre, m.
     """
 
     frame: Ints
@@ -60,10 +60,10 @@ class Boxes:
 
 
 def views(settings: DriveSettings, camera: Camera, map_T_camera: Floats, points: Floats, extents: Floats) -> Views:
-    """Compute the objects that a camera sees at each of its poses map_T_camera (F, 4, 4).
+    """Return the views of the objects that a camera sees at each of its poses map_T_camera (F, 4, 4).
 
-    points: the centres of the objects in map, m: (N, 3), or (F, N, 3) for moving objects. extents: (N, 2) the width and
-    height of the objects, m.
+    points: the centres of the objects in map, m. Their shape is (N, 3), or (F, N, 3) for moving objects. extents: (N, 2) the
+    width and height of the objects, m.
     """
     camera_T_map = inverse(map_T_camera)
     local = points @ np.swapaxes(camera_T_map[:, :3, :3], 1, 2) + camera_T_map[:, None, :3, 3]  # (F, N, 3)
@@ -78,15 +78,15 @@ def views(settings: DriveSettings, camera: Camera, map_T_camera: Floats, points:
 
 
 def _reach(settings: DriveSettings, size: Floats) -> Floats:
-    """Return the least distance (M, 2), px, of box centres from the image's edges. size: (M, 2) sizes of the boxes, px."""
+    """Return the least distance (M, 2), px, of a visible box centre from the image's edges. size: (M, 2) box sizes, px."""
     return np.zeros_like(size) if settings.cut_off else size / 2
 
 
 def detect(
     settings: DriveSettings, camera: Camera, seen: Views, label: Ints, seed: np.random.SeedSequence, first_id: int = 0
 ) -> Boxes:
-    """Return the boxes of visible objects, with noise and missed objects. label: (N,) the label of each object, as an index
-    into the classes. first_id: the id of object 0."""
+    """Return the boxes of visible objects. The boxes have noise, and some objects are missed. label: (N,) the label of each
+    object, as an index into the classes. first_id: the id of object 0."""
     noise, miss, score, depth = (np.random.default_rng(s) for s in seed.spawn(4))
     count = len(seen.frame)
     centre = seen.centre + settings.pixel_sigma * noise.standard_normal((count, 2))
@@ -113,7 +113,7 @@ def imagine(settings: DriveSettings, camera: Camera, classes: int, seed: np.rand
 
 
 def _of_surfaces(settings: DriveSettings, camera: Camera, seen: Views) -> Floats:
-    """Return the depths (M,) z, m, of the visible surfaces of objects. A camera measures these depths."""
+    """Return the depth (M,) z, m, of the visible surface of the object in each view. A camera measures this depth."""
     direction, _ = undistort(camera, seen.centre)
     box = np.concatenate([seen.centre - seen.size / 2, seen.centre + seen.size / 2], axis=1)
     share = 0.0 if settings.depth is None else settings.depth.surface
@@ -136,7 +136,8 @@ def order_of(boxes: Boxes) -> Ints:
 
 
 def detections(settings: DriveSettings, boxes: Boxes, frame_stamps: Floats, classes: tuple[str, ...]) -> Detections:
-    """Turn boxes into detections. They are sorted by frame, and within a frame the box with the highest score is first."""
+    """Return the boxes as detections, sorted by frame, and within a frame by score with the highest score first.
+    frame_stamps: (F,) the stamps of the images, s. classes: the class names."""
     order = order_of(boxes)
     b, tracks = boxes.take(order), _tracks(settings, boxes)[order]
     return Detections(frame_stamps, b.frame, b.box, b.label, b.score, b.depth, tracks, classes)
@@ -144,7 +145,7 @@ def detections(settings: DriveSettings, boxes: Boxes, frame_stamps: Floats, clas
 
 def with_features(cameras: list[Detections], objects: list[Ints], noise: AppearanceNoise, seed: int) -> list[Detections]:
     """Return the detections of all cameras with appearance vectors. objects: for each camera, the ids (M,) of the objects in
-    its boxes, -1 for a false box. Each false box has its own vector."""
+    its boxes, -1 for a false box. Each false box gets the vector of an object of its own."""
     rng = np.random.default_rng(seed)
     label, whose = np.concatenate([one.label for one in cameras]), np.concatenate(objects)
     whose = np.where(whose < 0, whose.max(initial=-1) + 1 + np.arange(len(whose)), whose)
@@ -163,12 +164,11 @@ def with_features(cameras: list[Detections], objects: list[Ints], noise: Appeara
 
 
 def _scale(prototype: Floats, kind: Ints, standing: Bools, whose: Ints, error: Floats, confusion: float) -> float:
-    """Return the factor on the errors (M, D) that makes a share of the boxes look like a wrong object.
+    """Return the factor of the errors (M, D) at which a share `confusion` of the boxes looks like a wrong object.
 
-    With this factor, the vectors of a share `confusion` of the boxes are nearer to another object of the same label.
-
-    prototype: (N, D) the vectors of the objects. kind: (N,) the labels of the objects. standing: (N,) which objects have
-    more than one box. whose: (M,) the object of each box.
+    The vector of such a box is nearer to the vector of another object with the same label. prototype: (N, D) the vectors of
+    the objects. kind: (N,) the labels of the objects. standing: (N,) whether an object has more than one box. whose: (M,)
+    the object of each box.
     """
     low, high = 0.0, _MOST_NOISE
     for _ in range(_HALVINGS):

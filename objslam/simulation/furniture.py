@@ -26,9 +26,9 @@ class Lamp:
 class Room:
     """The content of a rendered room.
 
-    owner: (P,) the id of the object to which each part belongs, -1 for furniture and other things. labels: the labels of the
-    N objects. middle: (N, 3) the centre of each object's bounding box in map, m. ambient: (3,) the linear RGB colour of
-    ambient light.
+    parts: the P meshes. owner: (P,) the id of the object to which each part belongs, -1 for furniture and other things.
+    labels: the labels of the N objects. middle: (N, 3) the centre of each object's bounding box in map, m. ambient: (3,) the
+    linear RGB colour of ambient light.
     """
 
     parts: tuple[Part, ...]
@@ -40,7 +40,8 @@ class Room:
 
 
 def object_sizes(room: Room) -> tuple[Floats, Floats]:
-    """Return length, width and height (N, 3), m, and yaws (N,), rad, of the smallest upright boxes around the objects."""
+    """Return the sizes (N, 3), m, and the yaws (N,), rad, of the smallest upright boxes around the objects. A size is
+    length, width and height. The yaw is the direction of the length in map."""
     yaws = np.radians(np.arange(180))
     turns = np.stack([np.stack([np.cos(yaws), np.sin(yaws)]), np.stack([-np.sin(yaws), np.cos(yaws)])])  # (side, axis, yaw)
     sizes, best = np.zeros((len(room.labels), 3)), np.zeros(len(room.labels))
@@ -194,7 +195,7 @@ def _cabinet(width: float, depth: float, height: float, rng: np.random.Generator
 
 
 def _distractor(rng: np.random.Generator) -> list[Part]:
-    """Draw a random thing that is none of the paper's seven objects: a box, tin, bottle, ball, cone, ring or post."""
+    """Make a random thing that is not one of the paper's seven objects: a box, tin, bottle, ball, cone, ring or post."""
     first, second = any_material(rng), any_material(rng)
     r, h = float(rng.uniform(0.03, 0.08)), float(rng.uniform(0.06, 0.28))
     w, d = rng.uniform(0.06, 0.22, 2)

@@ -16,10 +16,10 @@ from objslam.simulation.furniture import Room
 Reals = NDArray[np.floating]
 
 NEAR = 0.05  # The least depth of an object's points, m. An object with a nearer point counts as partly behind the camera.
-_NOISE = 64  # The grid points of the 3D noise along each axis. With a larger value, the noise repeats less often.
+_NOISE = 64  # The number of grid points of the 3D noise along each axis. With more points, the noise repeats less often.
 _STRIP = 32
-"""The number of rows that are shaded at a time. The arrays of such a strip fit into a processor's cache. A larger number is
-slower: with whole images of 640 x 480 px, rendering takes a fifth more time."""
+"""The number of image rows that are shaded at a time. The arrays of 32 rows fit into a processor's cache. A larger number
+is slower: if whole images of 640 x 480 px are shaded at once, rendering takes a fifth more time."""
 _PATTERNS = {"plain": 0, "noise": 1, "stripes": 2, "checks": 3}
 
 
@@ -74,7 +74,7 @@ class Caster:
 
     @cached_property
     def _grain(self) -> Reals:
-        """Smooth periodic noise in [0, 1] on a cube of _NOISE^3 points, flattened."""
+        """Smooth periodic noise in [0, 1] on a cube of _NOISE^3 points, as a flat array."""
         from scipy.ndimage import gaussian_filter
 
         rng = np.random.default_rng(self.seed)
@@ -98,11 +98,12 @@ class Caster:
         return Cast(depth, part, hit["primitive_normals"].numpy(), point)
 
     def owners(self, cast: Cast) -> Ints:
-        """Return the id (H, W) of the object at each pixel, -1 for none."""
+        """Return the id (H, W) of the object at each pixel, or -1 where no object is visible."""
         return np.append(self.room.owner, -1)[cast.part]
 
     def silhouettes(self, map_T_camera: Floats, chosen: Ints) -> Ints:
-        """Count the pixels (M,) that each chosen object would cover if nothing hid it. chosen: (M,) the ids."""
+        """Return the number (M,) of pixels that each chosen object would cover if nothing hid it. The number is 0 if a part
+        of the object is nearer than `NEAR`. chosen: (M,) the ids of the objects."""
         counts = np.zeros(len(chosen), dtype=np.int64)
         for i, number in enumerate(chosen):
             window = self._window(number, map_T_camera)
@@ -114,7 +115,8 @@ class Caster:
     def full_sizes(self, map_T_camera: Floats, chosen: Ints) -> Floats:
         """Return the width and height (M, 2), px, that the boxes of objects would have if the image had no edges.
 
-        chosen: (M,) the ids. The size is inf if a part of the object is nearer than `NEAR` or outside the lens field.
+        chosen: (M,) the ids of the objects. The width and height are inf if a part of the object is nearer than `NEAR`, or
+        outside the field of the lens.
         """
         sizes = np.full((len(chosen), 2), np.inf)
         for i, number in enumerate(chosen):
@@ -129,7 +131,8 @@ class Caster:
         return np.asarray(points @ camera_T_map[:3, :3].T + camera_T_map[:3, 3])
 
     def _window(self, number: int, map_T_camera: Floats) -> tuple[slice, slice] | None:
-        """Return the rows and columns around an object. Returns None if it is not in view or partly behind the camera."""
+        """Return the rows and columns around an object. Return None if the object is out of view or partly behind the
+        camera."""
         local = self._local(number, map_T_camera)
         if local[:, 2].min() < NEAR:
             return None
@@ -141,12 +144,16 @@ class Caster:
         return (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)) if len(rows) else None
 
     def shade(self, cast: Cast, eye: Floats) -> Reals:
-        """Compute the linear RGB colour (H, W, 3), with reflections and shadows. eye: (3,) the camera position in map, m."""
+        """Return the linear RGB colour (H, W, 3) of each pixel, with reflections and shadows.
+
+        eye: (3,) the camera position in map, m.
+        """
         starts = range(0, len(cast.depth), _STRIP)
         return np.concatenate([self._shade_strip(cast.rows(slice(start, start + _STRIP)), eye) for start in starts])
 
     def _shade_strip(self, cast: Cast, eye: Floats) -> Reals:
-        """Shade some rows. Inside, the axis of x, y, z and of the colours comes first, because NumPy is fast then."""
+        """Return the colours of some rows, as `shade` does. The arrays in this function have the axis of x, y, z or of the
+        colours first, because NumPy is fast with this order."""
         albedo, gloss = self._albedo(cast)
         point, normal = (np.ascontiguousarray(np.moveaxis(values, -1, 0)) for values in (cast.point, cast.normal))
         view = _unit(_column(eye) - point)

@@ -28,10 +28,10 @@ from objslam.simulation.trajectory import frame_stamps, localization, odometry
 
 TRUTH_BOXES = "boxes.jsonl"
 """The name of the file of true boxes, which is in the groundtruth folder. It has the format of detections.jsonl."""
-ROUNDS = 40  # The largest number of random rooms that are tried. With a larger value, more settings find a good room.
+ROUNDS = 40  # The largest number of random rooms that are tried. With more rooms, more settings lead to a good room.
 LOOK_AHEAD = 4
-"""The factor by which the width and the height of the images are divided when a room is tried. With a larger factor, the
-trial is faster and less exact."""
+"""The divisor of the width and the height of the images while a room is tried. With a larger divisor, the trial is faster
+and less exact."""
 
 
 class BoxLimits(Section):
@@ -56,8 +56,9 @@ class RenderSettings(CourseSettings):
     camera: InstanceOf[Camera] = make_camera(focal=400.0, position=(0.1, 0.0, 1.0), pitch=-0.25)
     labels: tuple[str, ...] = LABELS  # The labels of the objects in the room. A label may be repeated.
     min_views: Annotated[int, Field(ge=0)] = 18
-    """The least number of images in which each object has a good box: within `limits`, and not cut off by the edge."""
-    min_parallax_deg: NotNegative = 33.0  # The least parallax of each object over these images, degrees.
+    """The least number of images in which each object has a good box. A good box is within `limits`, and the image's edge
+    does not cut it off."""
+    min_parallax_deg: NotNegative = 33.0  # The least parallax of each object over the images with a good box, degrees.
     limits: BoxLimits = BoxLimits()
     sensor: Sensor = Sensor()
 
@@ -93,7 +94,8 @@ class TrueBoxes:
 
 
 def true_boxes(caster: Caster, cast: Cast, map_T_camera: Floats, limits: BoxLimits, scale: float = 1.0) -> TrueBoxes:
-    """Compute the true boxes of an image, sorted by object. `limits` apply to an image that is `scale` times as large."""
+    """Return the true boxes of an image, sorted by object. The limits in px apply to an image that is `scale` times as
+    large, because rooms are tried with small images."""
     owner = caster.owners(cast)
     rows, columns = np.nonzero(owner >= 0)
     objects, place, visible = np.unique(owner[rows, columns], return_inverse=True, return_counts=True)
@@ -188,7 +190,7 @@ def render_drive(
 
 
 def drive_room(settings: RenderSettings, seed: int) -> Room:
-    """Return the room that `render_drive` renders for these settings and seed. Raises ConfigError if it finds no room."""
+    """Return the room that `render_drive` renders for the same settings and seed. Raises ConfigError if there is none."""
     seeds = np.random.SeedSequence(seed).spawn(5)
     course = Course.lay(settings.motion, np.random.default_rng(seeds[0]))
     stamps = frame_stamps(settings.motion)[:, 0]

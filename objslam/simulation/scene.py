@@ -27,12 +27,13 @@ CLEARANCE = 0.4  # The least horizontal distance of random objects from the path
 CHECKED_FRAMES = 500
 """The largest number of images of each camera in which the position of a new object is tested. These images are evenly
 spaced."""
-ROUNDS = 50  # The most sets of random positions that are drawn. With more sets, positions are found for more objects.
+ROUNDS = 50  # The largest number of sets of random positions. With more sets, positions are found for more objects.
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The standing objects. label: (N,) indices into classes. position: (N, 3) in map, m. extent: (N, 2), m."""
+    """The standing objects. label: (N,) indices into `classes`. position: (N, 3) the centres in map, m. extent: (N, 2) the
+    width and height, m."""
 
     classes: tuple[str, ...]
     label: Ints
@@ -61,7 +62,7 @@ class Roamers:
 
 
 def furnish(settings: DriveSettings, path: Path, frame_stamps: Floats, rng: np.random.Generator) -> Scene:
-    """Place the objects of `settings.placed`, then random objects at positions that are seen well from the path.
+    """Place the objects of `settings.placed`, and random objects at positions that the cameras see well.
 
     frame_stamps: (F, C) the stamps of the images of C cameras, s. Raises ConfigError if there are not enough such positions.
     """
@@ -98,7 +99,10 @@ def _bounds(settings: DriveSettings) -> tuple[Floats, Floats]:
 
 
 def _places(settings: DriveSettings, path: Path, frame_stamps: Floats, extent: Floats, rng: np.random.Generator) -> Floats:
-    """Return random good positions (N, 3) in map, m, at least `min_distance` apart. extent: (N, 2) sizes of objects, m."""
+    """Return random positions (N, 3) in map, m, that are good (`_good`) and at least `min_distance` apart.
+
+    extent: (N, 2) the width and height of the objects, m. Raises ConfigError if there are not enough such positions.
+    """
     places = np.zeros((0, 3))
     for _ in range(ROUNDS):
         if len(places) == settings.objects:
@@ -117,7 +121,8 @@ def _places(settings: DriveSettings, path: Path, frame_stamps: Floats, extent: F
 
 
 def _good(settings: DriveSettings, path: Path, frame_stamps: Floats, places: Floats, extent: Floats) -> Bools:
-    """Return a mask (P,) of the positions (P, 3) away from the path that enough images see with enough parallax."""
+    """Return a mask (P,) of the good positions. A good position is far enough from the path, and enough images see it, with
+    enough parallax. places: (P, 3) the positions in map, m. extent: (2,) the width and height of an object, m."""
     way = path.at(START + np.linspace(0.0, path.lap, 1000))[:, :2]
     free = cKDTree(way).query(places[:, :2])[0] >= CLEARANCE
     checked = np.linspace(0, settings.frames - 1, min(settings.frames, CHECKED_FRAMES)).astype(int)
@@ -134,8 +139,11 @@ def _good(settings: DriveSettings, path: Path, frame_stamps: Floats, places: Flo
 
 
 def _spread(directions: Floats, seen: Bools) -> Floats:
-    """Return a lower bound (P,), rad, of the widest angle between directions (V, P, 3). seen: (V, P) which of them count."""
-    # Go twice to the direction furthest from the last one. For directions in a plane, this gives the widest angle.
+    """Return a lower bound (P,), rad, of the widest angle between the V directions of each position.
+
+    directions: (V, P, 3). seen: (V, P) a mask of the directions that count.
+    """
+    # Start at one direction. Twice, go to the direction that is furthest away. In a plane, this gives the widest angle.
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     pick = seen.argmax(axis=0)
     for _ in range(2):

@@ -8,10 +8,10 @@ from objslam.simulation.raycast import Reals
 from objslam.simulation.settings import Probability
 
 _STRIP = 32
-"""The number of rows that get their noise at a time. The arrays of such a strip fit into a processor's cache. A larger
-number is slower: whole images of 640 x 480 px take nearly twice the time."""
+"""The number of image rows that get their noise at a time. The arrays of 32 rows fit into a processor's cache. A larger
+number is slower: if whole images of 640 x 480 px get their noise at once, this takes nearly twice the time."""
 _GAMMA = (255 * np.linspace(0.0, 1.0, 4096) ** (1 / 2.2) + 0.5).astype(np.uint8)
-"""The 8-bit value of each of 4096 steps of linear light, with a gamma of 2.2. More steps round the dark values less."""
+"""The 8-bit value for each of 4096 steps of linear light, with a gamma of 2.2. More steps make dark values more exact."""
 
 
 class Sensor(Section):
@@ -23,8 +23,11 @@ class Sensor(Section):
     """The standard deviation of the error of each colour channel's gain. The errors are drawn once for a drive."""
     blur: NotNegative = 0.5  # The sigma of the lens blur, px.
     vignette: Probability = 0.2  # The share of light that is lost in the image's corners.
-    shot: NotNegative = 0.02  # The standard deviation of the shot noise at full light. It grows as the root of the light.
-    read: NotNegative = 0.006  # The standard deviation of the read noise, which is also present in the dark.
+    shot: NotNegative = 0.02
+    """The standard deviation of the shot noise at full light, as a share of full light. The noise is proportional to the
+    square root of the light."""
+    read: NotNegative = 0.006
+    """The standard deviation of the read noise, as a share of full light. The read noise is also present in the dark."""
     depth_sigma: NotNegative = 0.002  # The constant part of the depth noise, m.
     depth_sigma_per_m2: NotNegative = 0.002
     """The part of the depth noise that grows with the square of the depth, m per m^2."""
@@ -34,7 +37,7 @@ class Sensor(Section):
 
 
 def exposures(sensor: Sensor, frames: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw the gains (F, 3) of the colour channels in each image, relative to automatic exposure. They vary slowly."""
+    """Draw the gains (F, 3) of the colour channels in each image, relative to automatic exposure. The gains drift slowly."""
     steps = rng.standard_normal(frames)
     wander = np.empty(frames)
     value = steps[0]
@@ -46,7 +49,8 @@ def exposures(sensor: Sensor, frames: int, rng: np.random.Generator) -> NDArray[
 
 
 def expose(sensor: Sensor, light: Reals, gain: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Turn linear light (H, W, 3) into an 8-bit RGB image (H, W, 3). If `gain` (3,) is 1, the mean light becomes 0.25."""
+    """Turn linear light (H, W, 3) into an 8-bit RGB image (H, W, 3). gain: (3,) the gain of each colour channel. A gain of 1
+    makes the mean light 0.25 of full light."""
     import cv2
 
     y, x = (np.linspace(-1, 1, count).astype(np.float32) for count in light.shape[:2])

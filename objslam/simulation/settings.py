@@ -40,7 +40,10 @@ def make_camera(
 
 
 class PoseNoise(Section):
-    """The standard deviations of a planar pose, or of a step between two poses. xy: along x and y each, m. yaw: rad."""
+    """The standard deviations of a planar pose, or of a step between two poses.
+
+    xy: the standard deviation along x, and along y, m. yaw: the standard deviation of the yaw, rad.
+    """
 
     xy: NotNegative = 0.0
     yaw: NotNegative = 0.0
@@ -53,18 +56,18 @@ class DepthNoise(Section):
     sigma_per_m: NotNegative = 0.02  # The part of the standard deviation that grows with the depth, m per m.
     missing: Probability = 0.0  # The share of boxes whose depth is missing (NaN).
     wrong: Probability = 0.0  # The share of boxes with a wrong depth, which is random from 0.3 m to max_range.
-    surface: NotNegative = 0.5  # The distance from an object's surface to its centre, as a share of half its width.
+    surface: NotNegative = 0.5  # The distance from an object's surface to its centre, as a share of the half width.
 
 
 class AppearanceNoise(Section):
     """The appearance vectors of boxes, and how often they confuse objects.
 
-    The vector of a box is the vector of its object plus noise. The vector confuses its object if it is nearer to the vector
-    of another object with the same label. The noise follows from the share of confused boxes.
+    The vector of a box is the vector of its object plus noise. A box is confused if its vector is nearer to the vector of
+    another object with the same label. The noise is chosen so that the share of confused boxes is `confusion`.
     """
 
     confusion: Probability = 0.2  # The share of boxes that are confused, among those of labels with two objects or more.
-    numbers: Annotated[int, Field(ge=2)] = 64  # The number of numbers in a vector.
+    numbers: Annotated[int, Field(ge=2)] = 64  # The number of components of a vector.
     common: Probability = 0.6  # The share of the squared length of a vector that all objects of a label have in common.
 
 
@@ -75,17 +78,18 @@ class CourseSettings(Section):
     room: tuple[Positive, Positive] = (8.0, 6.0)
     """The size of the room along x and y, m. The origin of the map is the centre of the floor."""
     path: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (2, 3)
-    """The numbers of swings of a Lissajous curve along x and y in a lap, without a common divisor. (1, 1) is an ellipse."""
+    """The numbers of swings of the path along x and along y in a lap. The path is a Lissajous curve. The numbers have no
+    common divisor. (1, 1) is an ellipse."""
     margin: Positive = 1.0  # The distance between the path and the walls, m.
     frames: Annotated[int, Field(ge=2)] = 300
     """The number of images of each camera."""
     together: bool = False
-    """Whether several cameras take their images at the same time. If not, they take them one after the other."""
+    """Whether several cameras take their images at the same time. If False, the cameras take turns."""
     frame_rate: Positive = 5.0  # The number of images of each camera per second, Hz.
     laps: Positive | None = None  # The number of laps in the whole drive, which determines the speed.
     odometry: config.Odometry | PoseNoise | None = PoseNoise()
-    """The noise of the odometry. config.Odometry: noise that grows with distance and turn, without its floors. PoseNoise:
-    noise for the time between two images. None: no odometry."""
+    """The noise of the odometry. config.Odometry: the noise grows with the distance and the angle of a step, and the floors
+    of this section are ignored. PoseNoise: the noise of a step between two images. None: there is no odometry."""
     localization: PoseNoise | None = PoseNoise()  # The error of each localised pose. None: no localisation.
 
 
@@ -96,18 +100,19 @@ class DriveSettings(CourseSettings):
     cameras: tuple[InstanceOf[Camera], ...] = (make_camera(),)
     max_range: Positive = 6.0  # The largest distance at which a camera sees an object, m.
     cut_off: bool = False
-    """Whether boxes are cut off at the image's edge, like boxes of real detectors. If not, objects at the edge get no
+    """Whether boxes are cut off at the image's edge, like boxes of real detectors. If False, objects at the edge get no
     box."""
     objects: Annotated[int, Field(ge=0)] = 15
     """The number of objects at random positions."""
     classes: Annotated[int, Field(ge=1)] | None = None
-    """The number of classes of the objects, assigned in turn. None gives each object its own class."""
+    """The number of classes. The objects get the classes in turn. None gives each object its own class."""
     placed: tuple[tuple[str, tuple[float, float, float]], ...] = ()
     """The label and the x, y, z (m, in map) of additional objects. They have the first ids."""
     heights: tuple[float, float] = (0.1, 1.5)  # The range of the heights of the objects' centres, m.
     min_distance: NotNegative = 0.6  # The least distance between two random objects, m.
     min_view_share: Probability = 0.1
-    """How many images of all cameras must show each random object, as a share of the number of images of one camera."""
+    """The least number of images that show a random object, as a share of the number of images of one camera. The images of
+    all cameras count."""
     min_parallax_deg: NotNegative = 30.0  # The least parallax over the views of a random object, degrees.
     moving: Annotated[int, Field(ge=0)] = 0
     """The number of moving objects. They have the classes of the other objects and are not in the ground truth."""
@@ -163,7 +168,10 @@ def preset(name: str, **changes: Any) -> DriveSettings:
 
 
 def pair(distance: float, label: str = "cup", **changes: Any) -> DriveSettings:
-    """Return a drive around two objects of one class, `distance` (m) apart. The camera looks left at them from 1 to 4 m."""
+    """Return the settings of a drive around two objects of one class. distance: the distance of the objects, m.
+
+    The camera looks to the left, at the objects, from 1 to 4 m away. changes: changes to the settings.
+    """
     camera = make_camera("left", focal=380.0, position=(0.0, 0.0, 0.3), yaw=np.pi / 2)
     places = ((label, (1.5, -distance / 2, 0.4)), (label, (1.5, distance / 2, 0.4)))
     drive = {"name": "pair", "room": (7.0, 7.0), "path": (1, 1), "laps": 1.0, "objects": 0, "placed": places}

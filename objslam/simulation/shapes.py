@@ -16,7 +16,8 @@ Pattern = Literal["plain", "noise", "stripes", "checks"]
 
 @dataclass(frozen=True)
 class Material:
-    """The look of a surface: a 3D pattern of two linear RGB colours (3,). scale: the pattern's size, m. gloss: its shine."""
+    """The look of a surface: a 3D pattern of two linear RGB colours (3,). scale: the size of the pattern, m. gloss: the
+    strength of the reflections of lamps, 0 for a dull surface."""
 
     colour: Floats
     second: Floats
@@ -52,7 +53,8 @@ def turned(profile: list[tuple[float, float]], material: Material, segments: int
 
 
 def torus(radius: float, thickness: float, height: float, material: Material, segments: int = 36) -> Part:
-    """Make a horizontal ring. radius: of its centre line, m. thickness: the tube's radius, m. height: of its centre, m."""
+    """Make a horizontal ring. radius: the radius of the centre line, m. thickness: the radius of the tube, m. height: the
+    height of the ring's centre, m."""
     angle = np.linspace(0.0, 2 * np.pi, 14, endpoint=False)
     rings = np.column_stack([radius + thickness * np.cos(angle), height + thickness * np.sin(angle)])
     return _swept(rings, True, material, segments)

@@ -13,15 +13,17 @@ from objslam.simulation.settings import DriveSettings, PoseNoise
 
 START = 1_700_000_000.0  # The stamp of the start of every drive, s.
 WHEEL_OFFSET = 0.5
-"""The distance (m) from the robot's centre of a wheel that moves at constant speed. A larger value makes bends slower."""
+"""The distance from the robot's centre to a wheel in front of it, m. This wheel moves at constant speed. With a larger
+value, the robot is slower in bends."""
 
 
 @dataclass(frozen=True)
 class Path:
     """A Lissajous curve that the robot drives repeatedly.
 
-    reach: (2,) the amplitudes along x and y, m. parameter: (T,) samples of the curve parameter over one lap. time: (T,) the
-    time in the lap at each sample, s. offset: the time in the lap at which the drive starts, s.
+    reach: (2,) the amplitudes along x and y, m. swings: the numbers of swings along x and y in a lap. parameter: (T,)
+    samples of the curve parameter over one lap. time: (T,) the time from the start of the lap to each sample, s. offset: the
+    time from the start of the lap to the start of the drive, s.
     """
 
     reach: Floats
@@ -32,7 +34,7 @@ class Path:
 
     @classmethod
     def lay(cls, settings: DriveSettings, rng: np.random.Generator) -> Self:
-        """Make the path of a drive. It starts at a random position on the curve."""
+        """Make the path of a drive. The drive starts at a random position on the curve."""
         reach = np.array(settings.room) / 2 - settings.margin
         u = np.linspace(0.0, 2 * np.pi, 20_001)
         _, first, second = _curve(reach, settings.path, u)
@@ -68,15 +70,16 @@ def _integral(values: Floats, over: Floats) -> Floats:
 
 
 def frame_stamps(settings: DriveSettings) -> Floats:
-    """Return the stamps (F, C), s, of the F images of each of the C cameras. Without `together`, the cameras take turns at
-    even intervals."""
+    """Return the stamps (F, C), s, of the F images of each of the C cameras. If `settings.together` is False, the cameras
+    take turns at even intervals."""
     cameras = len(settings.cameras)
     later = np.zeros(cameras) if settings.together else np.arange(cameras) / cameras
     return START + (np.arange(settings.frames)[:, None] + later) / settings.frame_rate
 
 
 def odometry(settings: DriveSettings, path: Path, stamps: Floats, rng: np.random.Generator) -> Trajectory | None:
-    """Simulate odom_T_base (None without odometry) as the sum of true steps with noise. stamps: (F,) of the images, s."""
+    """Simulate the odometry odom_T_base, as the sum of the true steps with noise. Return None if the drive has no odometry.
+    stamps: (F,) the stamps of the images, s."""
     if settings.odometry is None:
         return None
     stamps = _clock(settings.odometry_rate, stamps)
@@ -92,7 +95,10 @@ def odometry(settings: DriveSettings, path: Path, stamps: Floats, rng: np.random
 
 
 def _step_sigmas(noise: config.Odometry | PoseNoise, steps: Floats, frames: Floats) -> Floats:
-    """Compute the standard deviations (S, 3) of steps (S, 3). frames: (S,) the durations, in units of the time per image."""
+    """Return the standard deviations (S, 3) of the noise of steps (S, 3), each as x, y (m) and yaw (rad).
+
+    frames: (S,) the durations of the steps, as multiples of the time between two images.
+    """
     if isinstance(noise, PoseNoise):
         return np.sqrt(frames)[:, None] * np.array([noise.xy, noise.xy, noise.yaw])
     way, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
@@ -102,7 +108,8 @@ def _step_sigmas(noise: config.Odometry | PoseNoise, steps: Floats, frames: Floa
 
 
 def localization(settings: DriveSettings, path: Path, stamps: Floats, rng: np.random.Generator) -> Trajectory | None:
-    """Simulate map_T_base (None without localisation): true poses with independent errors. stamps: (F,) of the images, s."""
+    """Simulate the localisation map_T_base, as true poses with independent errors. Return None if the drive has no
+    localisation. stamps: (F,) the stamps of the images, s."""
     noise = settings.localization
     if noise is None:
         return None
@@ -112,7 +119,7 @@ def localization(settings: DriveSettings, path: Path, stamps: Floats, rng: np.ra
 
 
 def _clock(rate: float | None, frame_stamps: Floats) -> Floats:
-    """Return stamps at `rate` (Hz) that cover all images. Without a rate, return the stamps of the images."""
+    """Return stamps, s, at `rate` (Hz) that cover all images. If `rate` is None, return the stamps of the images."""
     if rate is None:
         return frame_stamps
     return START + np.arange(int(np.ceil((frame_stamps[-1] - START) * rate)) + 1) / rate

@@ -35,7 +35,7 @@ NAMES = Option(
     metavar="FILE|coco",
 )
 """The option that gives the names of numbered classes. All recordings, adapters and detectors have this option."""
-_KINDS = "Kind of the recording, such as ros or mrclam. A wrong name lists all. [default: found from its content]"
+_KINDS = "Kind of the recording, such as ros or mrclam. A wrong name lists all. Default: found from its content."
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ Speed = Annotated[
     float, typer.Option("--speed", min=0.0, help="Speed factor of a replay. 0 (also for stdin): as fast as the map follows.")
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue a session that was killed or has ended, from its journal.")]
-Interval = Annotated[float, typer.Option("--interval", min=0.1, help="Time in s between two writes of objects.json.")]
+Interval = Annotated[float, typer.Option("--interval", min=0.1, help="Time between two updates of objects.json, s.")]
 Publish = Annotated[
     bool, typer.Option("--publish", help="At each --interval, publish objects, markers and path over DDS for RViz and Nav2.")
 ]
@@ -63,7 +63,7 @@ def live(
     view: View = None,
     quiet: Quiet = False,
 ) -> None:
-    """Map objects while the robot drives. Update objects.json, and write a complete result folder at the end (Ctrl-C).
+    """Map objects while the robot drives. Update objects.json, and at the end (Ctrl-C), write a complete result folder.
 
     With --map, the exit code is 3 if the drive is not found in that map.
     """
@@ -150,7 +150,8 @@ def _publishing_tf(feed: Feed, options: LiveOptions, session: Session) -> Feed:
 
 
 def _say_what_is_not_used(source: str, options: LiveOptions, speed: float, publish: bool) -> None:
-    """Warn of the given options that have no effect on a source. `sources.read` checks the options for recordings."""
+    """Warn of the given options that have no effect on this source. `sources.read` warns of options that have no effect on
+    the kind of a recording."""
     adapter = ADAPTERS.get(source)
     taken = names(adapter.options if adapter else SourceOptions, NetworkOptions if publish else None)
     taken |= {"class_names"} if adapter else {"detector"}
@@ -160,13 +161,15 @@ def _say_what_is_not_used(source: str, options: LiveOptions, speed: float, publi
 
 
 def _is_recorded(source: str, speed: float) -> bool:
-    """Return whether the messages of an adapter are a recording. No frame of a recording may be dropped for its age."""
+    """Return whether the messages of an adapter come from a recording. No frame of a recording may be dropped because it is
+    late."""
     recorded = ADAPTERS[source].recorded
     return recorded is not None and (speed == 0 or recorded())
 
 
 def _read(path: Path, options: LiveOptions, settings: Settings, quiet: bool) -> tuple[Log, Ledger]:
-    """Read a recording to replay. If the options name a detector, it finds the boxes. LogError if there are no boxes."""
+    """Read a recording to replay. If the options name a detector, it finds the boxes. Raises LogError if the recording is
+    missing or has no boxes."""
     from objslam.api.mapping import find_boxes
     from objslam.core.diagnostics import Ledger
     from objslam.errors import LogError
@@ -188,8 +191,8 @@ def _read(path: Path, options: LiveOptions, settings: Settings, quiet: bool) -> 
 def _look_for_journal(file: Path, resume: bool, stack: ExitStack) -> None:
     """Check that a journal to resume exists, or rename the journal of an earlier session.
 
-    If the new session gets no message, the renamed journal gets its name back when the session ends. If such a session was
-    killed, this happens here, when the next session starts.
+    If the new session gets no message, the renamed journal gets its name back when the session ends. If a session was killed
+    before its first message, this function restores the name when the next session starts.
     """
     from objslam.errors import OutputError
     from objslam.sources.journal.aside import put_back, restore_after_kill, set_aside

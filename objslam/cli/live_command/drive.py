@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # The signals that end a session with a whole result.
 _POLL = 0.1
-"""The time in s between two checks for the end of the source, and between two ticks of the feed. A larger value reacts
-later."""
+"""The time between two checks for the end of the source, and between two ticks of the feed, s. With a larger value, the
+session reacts later."""
 
 
 class LatestObjects:
@@ -36,7 +36,8 @@ class LatestObjects:
         self._out, self._begun, self._refused = out, False, False
 
     def try_write(self, snapshot: Snapshot) -> None:
-        """Write as `write` does, but only warn of the first OutputError, and say when writing works again."""
+        """Write as `write` does, but warn of an OutputError instead of raising it. Errors in a row give only one warning.
+        Say when objects.json can be written again."""
         refused = None
         try:
             self.write(snapshot)
@@ -66,9 +67,9 @@ class LatestObjects:
 def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float, quiet: bool = False) -> Exception | None:
     """Run the adapter until it ends, the session fails, or the user presses Ctrl-C.
 
-    Every `interval` s, update objects.json, the views and, unless `quiet`, the status line. Ten times a second, call the
-    ticks of the feed and print new warnings. An error of a view or a tick also ends the loop. It is returned instead of
-    raised, so that `finish` can write the map first. An error of the adapter is only a warning.
+    Every `interval` s, update objects.json, the views and, unless `quiet` is True, the status line. Ten times a second, call
+    the ticks of the feed and print new warnings. An error of a view or a tick also ends the loop. This error is returned
+    instead of raised, so that `finish` can write the map first. An error of the adapter gives only a warning.
     """
     from objslam.live.session import low_latency
 
@@ -124,10 +125,11 @@ def finish(
     broken: Exception | None,
     quiet: bool = False,
 ) -> RunResult:
-    """End the session, write its result, print a summary unless `quiet`, and return the result.
+    """End the session, write its result, and return it. Print a summary unless `quiet` is True.
 
-    If the session ended early, raise its error afterwards, as an ObjslamError. Else raise `broken`, the error that `drive`
-    returned, if any. If there is no result, the last snapshot is written to objects.json.
+    broken: the error that `drive` returned, or None. If the session ended early, its error is raised as an ObjslamError
+    after the result is written. Else `broken` is raised. If there is no result, the last snapshot is written to
+    objects.json.
     """
     from objslam.cli.run import say_result
     from objslam.core.snapshot import CAME_BEFORE, TOO_SLOW
@@ -173,9 +175,9 @@ def _ended_early(failure: Exception, out: Path, map_: str) -> ObjslamError:
 
 @contextmanager
 def _ends_by_signal(stop: threading.Event) -> Iterator[None]:
-    """Set `stop` at Ctrl-C, SIGTERM, or when the terminal closes (SIGHUP). A second signal interrupts immediately.
+    """Set `stop` at Ctrl-C, at SIGTERM, or when the terminal closes (SIGHUP). A second signal raises KeyboardInterrupt.
 
-    A signal that is ignored, as nohup ignores SIGHUP, stays ignored.
+    A signal that the process ignores stays ignored. For example, nohup makes a process ignore SIGHUP.
     """
 
     def end(number: int, frame: object) -> None:

@@ -14,15 +14,15 @@ if TYPE_CHECKING:
     from objslam.core.diagnostics import Ledger
     from objslam.core.snapshot import Snapshot
 
-_LINES = 10.0  # The time in s between two status lines if stderr is not a terminal. A larger value prints fewer lines.
+_LINES = 10.0  # The least time between two status lines if stderr is no terminal, s. A larger value prints fewer lines.
 
 
 @contextmanager
 def status_line(quiet: bool = False) -> Iterator[Callable[[Snapshot, Ledger], None]]:
-    """Yield a function that shows a snapshot, and the drops of the adapter, in the status line on stderr.
+    """Yield a function that shows the status line on stderr. The function takes a snapshot and the ledger of the adapter.
 
-    On a terminal, the line is cut to the width. Else the function prints at most one line in ten seconds. With `quiet`, it
-    shows nothing.
+    On a terminal, the line is cut to the width of the terminal. Else the function prints at most one line in `_LINES` s. If
+    `quiet` is True, the function shows nothing.
     """
     if quiet:
         yield lambda snapshot, ledger: None
@@ -55,15 +55,15 @@ def status_line(quiet: bool = False) -> Iterator[Callable[[Snapshot, Ledger], No
 class _Rates:
     """The formatter of the status line. Message rates are averages since the previous status line.
 
-    A narrow terminal cuts the end of the line, so long reasons come last. Less important parts are left out until the number
-    of dropped data fits.
+    A narrow terminal cuts the end of the line, so long reasons come last. Less important parts are left out until the line
+    fits as far as the number of dropped data.
     """
 
     def __init__(self) -> None:
         self._before: tuple[float, dict[str, int]] = (time.monotonic(), {})
 
     def line(self, snapshot: Snapshot, ledger: Ledger, width: int | None = None) -> str:
-        """Return the status line, with rates since the last call.
+        """Return the status line, with the rates since the last call.
 
         width: the width of the terminal in characters. If it is None, no part of the line is left out.
         """
@@ -82,10 +82,10 @@ class _Rates:
 
 
 def _status(snapshot: Snapshot, ledger: Ledger, rates: dict[str, float], spare: int) -> tuple[str, int]:
-    """Return a status line, and the length up to the number of dropped data.
+    """Return a status line, and its length up to and including the number of dropped data.
 
-    spare: how much is left out, from 0 (nothing) on. From 1 on, the unresolved objects are left out, from 2 on the
-    keyframes, and from 3 on each path's rate.
+    spare: how much is left out. At 0, nothing is left out. At 1 and above, the number of unresolved objects is left out. At
+    2 and above, the number of keyframes is left out as well. At 3, the rates of odometry and localisation become one rate.
     """
     resolved = len(snapshot.map.resolved())
     found = f"{resolved} object{'' if resolved == 1 else 's'}"
@@ -111,7 +111,8 @@ def _status(snapshot: Snapshot, ledger: Ledger, rates: dict[str, float], spare: 
 
 
 def _lost(snapshot: Snapshot, ledger: Ledger) -> tuple[int, str]:
-    """Return the number of dropped data, and a text with the most frequent reason and the numbers of unused data by kind."""
+    """Return the number of dropped data, and a text. The text has the most frequent reason of a drop, and the number of
+    unused data of each kind."""
     from objslam.core.snapshot import NOT_USED
     from objslam.frontend.bearings import CUT_OFF
 
@@ -123,6 +124,7 @@ def _lost(snapshot: Snapshot, ledger: Ledger) -> tuple[int, str]:
 
 
 def times(snapshot: Snapshot, then: str) -> str:
-    """Return a text with the median and the 99th percentile of the update times, followed by `then`. "" without updates."""
+    """Return a text with the median and the 99th percentile of the update times, and with `then` at its end. Return "" if
+    there were no updates."""
     median, most = snapshot.update
     return f"update p50 {1e3 * median:.1f} ms, p99 {1e3 * most:.1f} ms{then}" if most > 0 else ""

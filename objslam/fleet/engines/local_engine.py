@@ -1,7 +1,8 @@
-"""The engines of a fleet: each runs a function on many arguments, and yields each answer as it comes.
+"""The engine of this machine, and the types that all engines share.
 
-An engine is called with the name of a function, "module:function", and its arguments. The number of arguments and answers
-that it holds is bounded, so that a fleet of any size needs the memory of a small one.
+An engine runs a function on many arguments, and yields each answer as soon as it is known. An engine is called with the name
+of the function, "module:function", and its arguments. It holds only a limited number of arguments and answers. So its memory
+does not grow with the size of the fleet.
 """
 
 from __future__ import annotations
@@ -23,9 +24,11 @@ from objslam.fleet.stores.store import StoreError
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The outcome of one task. value: what the function returned, None after a failure. message: the words of a failure.
+    """The outcome of one task. value: what the function returned, None after a failure. message: the text of the error after
+    a failure.
 
-    kind: the kind of a failure, which is `memory`, `time`, `lost`, `store` or `error`. It is empty after a success.
+    kind: the kind of a failure, which is `memory`, `time`, `lost`, `store` or `error`. It is empty after a success. running:
+    the number of tasks that run when an engine yields this answer.
     """
 
     argument: Any
@@ -36,15 +39,17 @@ class Answer:
 
 
 Engine = Callable[[str, Iterable[Any]], Iterator[Answer]]
-"""A function that runs the work, named as "module:function", on each argument, and yields the answers in any order."""
+"""The type of an engine. It is a function that gets the name of a function, "module:function", and its arguments. It runs
+this function on each argument, and yields the answers in any order."""
 
 _QUEUED = 2
-"""The most tasks of each process that are submitted and not answered yet. A larger number keeps processes busy while
-arguments come slowly."""
+"""The largest number of tasks of each process that are submitted and not answered yet. With a larger number, processes stay
+busy even if arguments come slowly."""
 
 
 def attempt(worker: Worker, work: str, argument: Any, limits: Limits) -> Answer:
-    """Run one task in a worker, and return its answer or its failure. The process that owns the worker calls this."""
+    """Run one task in a worker, and return its answer. A failure of the task is also an answer. Only the process that owns
+    the worker may call this function."""
     try:
         return Answer(argument, worker.call(work, argument, limits))
     except LimitError as error:
@@ -60,9 +65,9 @@ def attempt(worker: Worker, work: str, argument: Any, limits: Limits) -> Answer:
 
 
 class _Pool:
-    """Threads, each of which waits for the answers of a process of its own. A thread computes nothing.
+    """A pool of threads. Each thread has a process of its own, and only waits for the answers of this process.
 
-    The threads stay with their processes. A process dies with the thread that started it.
+    The threads live as long as their processes, because a process dies with the thread that started it.
     """
 
     def __init__(self, jobs: int, limits: Limits) -> None:
@@ -79,7 +84,7 @@ class _Pool:
         return attempt(self._own.worker, work, argument, self._limits)
 
     def end(self) -> None:
-        """End the processes, whatever they do, and then the threads, which wait for them."""
+        """End the processes, even if a task is running. Then end the threads, which wait for their processes."""
         self._threads.shutdown(wait=False, cancel_futures=True)
         for worker in self._workers:
             worker.close()
@@ -87,10 +92,10 @@ class _Pool:
 
 
 def local_engine(jobs: int, limits: Limits) -> Engine:
-    """Return the engine of this machine, with `jobs` processes. Each does one task at a time.
+    """Return the engine of this machine, with `jobs` processes. Each process does one task at a time.
 
-    The processes also do the tasks of the next call, so that each imports the libraries once. They end with the engine, and
-    with a call whose answers are not all taken.
+    The processes stay for the next call, so that each process imports the libraries once. They end when the engine is
+    deleted. They also end if a call fails, or if its caller does not take all answers.
     """
     pools: list[_Pool] = []
 
@@ -113,7 +118,7 @@ def _end(pools: list[_Pool]) -> None:
 
 
 def _in_flight(submit: Callable[[Any], Future[Answer]], arguments: Iterable[Any], jobs: int) -> Iterator[Answer]:
-    """Yield the answer of each task. jobs: the number of processes."""
+    """Yield the answer of each task. submit: starts the task of an argument. jobs: the number of processes."""
     left = iter(arguments)
     running = {submit(argument) for argument in islice(left, jobs * _QUEUED)}
     while running:
@@ -129,7 +134,7 @@ def cores() -> int:
 
 
 def memory_of_machine() -> int:
-    """Return the bytes of RAM of this machine, or of its container if that may use less."""
+    """Return the RAM, bytes, of this machine, or of its container if the container may use less."""
     whole = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     try:
         return min(whole, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))

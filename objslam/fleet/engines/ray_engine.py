@@ -1,6 +1,7 @@
-"""The engine of a Ray cluster. Each task is a Ray Core task; its worker is a process of the node that runs it.
+"""The engine of a Ray cluster. Each task is a task of Ray Core. Its worker is a process of the node that runs the task.
 
-Ray places the tasks and runs them again when a node is lost. Results go to the store by their names, never through Ray.
+Ray places the tasks, and runs them again if a node is lost. Tasks write their results into the store, and never send them
+through Ray.
 """
 
 from __future__ import annotations
@@ -19,24 +20,27 @@ from objslam.fleet.engines.local_engine import Answer, Engine, attempt
 from objslam.fleet.engines.worker import Limits, Worker
 
 _QUEUED = 2
-"""The number of tasks in flight for each CPU of the cluster, if the caller does not set their number. A larger number keeps
-more tasks ready for a free CPU."""
+"""The number of submitted tasks for each CPU of the cluster, if the caller does not set their number. With a larger number,
+more tasks are ready for a free CPU."""
 _PATIENT = 10.0
-"""How long the address of a cluster may take to accept a connection, s. A larger value waits longer for a wrong address."""
+"""The longest time (s) in which the address of a cluster must accept a connection. With a larger value, the error for a
+wrong address comes later."""
 _GB = 1e9
 _LEASE = "RAY_worker_lease_timeout_milliseconds", "60000"
-"""The environment variable of Ray that says how long a driver keeps a process, and its value, ms. After a longer task, the
-driver gives the process back and asks for another process. This takes 0.1 s a log with the 500 ms of Ray, and 7 ms with this
-value (tasks of 1 s on two nodes). With a larger value, other drivers of a full cluster wait longer."""
+"""The name and the value of an environment variable of Ray: the time (ms) for which a driver keeps a process. After a task
+that takes longer, the driver gives the process back and requests another one. With tasks of 1 s on two nodes, this takes 0.1
+s per log at Ray's default of 500 ms, and 7 ms at this value. With a larger value, other drivers of a full cluster wait
+longer."""
 
 _worker = Worker()
-"""The worker of this process of Ray. It is kept between tasks, so that libraries are imported once."""
+"""The worker of this process of Ray. It stays between tasks, so that it imports the libraries once."""
 atexit.register(_worker.close)
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """A cluster that was joined. cpus, gpus: of all nodes. dashboard: the address of its own page, empty if it has none."""
+    """A cluster that this process joined. cpus, gpus: the numbers of CPUs and GPUs of all nodes. dashboard: the address of
+    the cluster's web page, empty if it has none."""
 
     cpus: float
     gpus: float
@@ -44,11 +48,12 @@ class Cluster:
 
 
 def join_cluster(address: str) -> Cluster:
-    """Join the Ray cluster at an address, or with `auto` the one that runs here. No cluster is ever started.
+    """Join the Ray cluster at an address. The address `auto` means the cluster that runs on this machine. This function
+    never starts a cluster.
 
     ObjslamError if Ray is not installed, or if no cluster answers.
     """
-    os.environ.setdefault(*_LEASE)  # Ray reads it when it is imported.
+    os.environ.setdefault(*_LEASE)  # Ray reads this variable at its import.
     try:
         import ray
     except ModuleNotFoundError as error:
@@ -56,7 +61,7 @@ def join_cluster(address: str) -> Cluster:
     hint = "start one with ray start, or leave --ray out to use the processes of this machine"
     host, mark, port = address.removeprefix("ray://").rpartition(":")
     try:
-        if mark and port.isdigit():  # Ray itself waits for minutes where nobody listens.
+        if mark and port.isdigit():  # Without a listener, Ray itself waits for minutes.
             socket.create_connection((host.strip("[]"), int(port)), _PATIENT).close()
         context = ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, OverflowError, ValueError, RuntimeError) as error:
@@ -66,7 +71,7 @@ def join_cluster(address: str) -> Cluster:
 
 
 def leave_cluster() -> None:
-    """Leave the cluster that `join_cluster` joined. The cluster goes on."""
+    """Leave the cluster that `join_cluster` joined. The cluster keeps running."""
     import ray
 
     ray.shutdown()
@@ -75,8 +80,9 @@ def leave_cluster() -> None:
 def ray_engine(limits: Limits, *, most: int, memory: int, gpus: float) -> Engine:
     """Return the engine of the cluster that was joined. Each task takes one CPU.
 
-    most: the most tasks in flight, 0 for twice the CPUs of the cluster. memory: the bytes that each task reserves on its
-    node, 0 for none. gpus: the share of a GPU that each task takes. ConfigError if no node has enough for one task.
+    most: the largest number of submitted tasks, 0 for twice the number of CPUs of the cluster. memory: the memory, bytes,
+    that each task reserves on its node, 0 for none. gpus: the share of a GPU that each task takes. ConfigError if no node
+    has enough for one task.
     """
     import ray
 

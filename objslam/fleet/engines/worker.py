@@ -1,8 +1,9 @@
-"""A process that does one task after another, with a limit of memory and of time for each.
+"""A process that does one task after another. Each task has a memory limit and a time limit.
 
-A task is a function, named as "module:function", and one argument. The limits are watched from outside, because native code
-neither returns to Python nor lets another thread of its process run. The memory is the RAM of the process. RLIMIT_AS and
-RLIMIT_DATA do not limit it: they count what libraries reserve, 2.0 and 1.35 GB for a process that uses 0.28 GB.
+A task is a function, named as "module:function", and one argument. The parent of the process checks the limits, because
+native code neither returns to Python nor lets another thread of its process run. The memory limit is a limit on the RAM of
+the process. RLIMIT_AS and RLIMIT_DATA cannot set such a limit, because they also count memory that libraries only reserve.
+For a process that uses 0.28 GB, they count 2.0 and 1.35 GB.
 """
 
 from __future__ import annotations
@@ -25,20 +26,21 @@ from typing import Any
 from objslam.errors import ObjslamError
 
 _WATCH = 0.05
-"""The pause between two looks at memory and time, s. A larger value costs less, and ends a task later."""
+"""The time (s) between two checks of the limits. With a larger value, the checks cost less, and a task beyond its limit ends
+later."""
 _TIRED = 0.5
-"""The share of the memory limit that a process may still use after a task. A process that uses more is replaced, so that the
-next task has its memory. A larger share replaces processes less often."""
+"""The largest share of the memory limit that a process may still use after a task. A process that uses more is replaced, so
+that the next task has enough memory. With a larger share, processes are replaced less often."""
 _THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""The environment variables that give numerical libraries one thread, because each core has a process of its own."""
+"""The environment variables that give each numerical library one thread, because each core has a process of its own."""
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux.
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The limits of a task. memory: bytes of RAM, 0 for no limit. seconds: its longest duration, s, 0 for no limit. retries:
-    how often the task begins again after its process died."""
+    """The limits of a task. memory: the most RAM, bytes, 0 for no limit. seconds: the longest duration, s, 0 for no limit.
+    retries: how often the task begins again after its process died."""
 
     memory: int = 0
     seconds: float = 0.0
@@ -46,7 +48,7 @@ class Limits:
 
 
 class LimitError(ObjslamError):
-    """A task needs more than its limit. kind: memory or time."""
+    """A task exceeds one of its limits. kind: the limit, `memory` or `time`."""
 
     def __init__(self, kind: str, message: str, hint: str) -> None:
         super().__init__(message, hint=hint)
@@ -54,11 +56,12 @@ class LimitError(ObjslamError):
 
 
 class LostError(ObjslamError):
-    """The process of a task died: by a signal, or because native code ended it."""
+    """The process of a task died by a signal, or because native code ended it."""
 
 
 class Worker:
-    """A process of this machine. It starts with its first task, and a process that died is replaced."""
+    """A process of this machine that does tasks. It starts with its first task. If it dies, the next try starts another
+    process."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
@@ -66,10 +69,10 @@ class Worker:
         self._closed = False
 
     def call(self, work: str, argument: Any, limits: Limits) -> Any:
-        """Return what the function `work` returns for an argument. The task begins again if its process dies.
+        """Return what the function `work` returns for an argument. If the process dies, the task begins again.
 
-        Raises what the function raises, LimitError for a task that is beyond a limit, and LostError if the process died
-        in every try.
+        Raises the error of the function, LimitError for a task that exceeds a limit, and LostError if the process died in
+        every try.
         """
         for left in range(limits.retries, -1, -1):
             try:
@@ -80,12 +83,12 @@ class Worker:
         raise AssertionError  # The last try returns or raises.
 
     def close(self) -> None:
-        """End the process, whatever it does, and start no other one. Any thread may call this."""
+        """End the process, even if it does a task, and start no other process. Any thread may call this method."""
         self._closed = True
-        process = self._process  # The thread of its task may set it to None meanwhile.
+        process = self._process  # Another thread may set self._process to None at any time.
         if process is not None:
             process.kill()
-            process.wait()  # If the process is idle, no thread of a task waits for its end.
+            process.wait()  # No other thread waits for the end of an idle process.
 
     def _end(self) -> None:
         """End the process. The next task starts another one."""
@@ -182,7 +185,7 @@ def serve(handle: int, parent: int) -> None:
 
 
 def _told(error: Exception) -> ObjslamError:
-    """Return an error that the parent can raise, with the text of an error whose class the parent may not know."""
+    """Return an `ObjslamError` with the text of another error. The parent may not know the class of the other error."""
     return ObjslamError(f"internal error, {type(error).__name__}: {error}", hint="please report it")
 
 

@@ -1,4 +1,4 @@
-"""Folders of this machine, or of a disk that all workers have."""
+"""Stores and sources in folders of this machine, or of a disk that all workers share."""
 
 from __future__ import annotations
 
@@ -19,16 +19,18 @@ def local_path(url: str) -> Path:
 
 
 class LocalStore:
-    """A folder of this machine, or of a disk that all workers have."""
+    """A store in a folder of this machine, or of a disk that all workers share."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder.absolute()
         self.url = str(self._folder)
 
     def names(self, prefix: str) -> list[str]:
-        """Return the names of the files directly in the folder `prefix`, without the folder, in order.
+        """Return the sorted names of the files directly in the folder `prefix`, without the folder. A missing folder gives
+        [].
 
-        Names with a dot in front are left out: they are parts of files that are being written.
+        Names that begin with a dot are left out, because they are files that a write has not finished. StoreError if the
+        folder cannot be read.
         """
         try:
             with os.scandir(self._folder / prefix) as entries:
@@ -39,7 +41,7 @@ class LocalStore:
             raise _failed(self._folder / prefix, error) from error
 
     def read(self, name: str) -> bytes:
-        """Return the content of a file. FileNotFoundError if there is none, StoreError if it cannot be read."""
+        """Return the content of a file. FileNotFoundError if the file does not exist, StoreError if it cannot be read."""
         try:
             return (self._folder / name).read_bytes()
         except FileNotFoundError:
@@ -60,8 +62,8 @@ class LocalStore:
     def write(self, name: str, data: bytes) -> None:
         """Write a file, and replace an older one. StoreError if it cannot be written.
 
-        A folder may have a file for each of a million logs, so no write lists it. `names` leaves out what killed
-        processes left.
+        A write does not list the folder, because the folder may have a file for each of a million logs. So a write does not
+        delete the temporary files of killed processes. `names` leaves these files out.
         """
         file = self._folder / name
         self._make(file.parent)
@@ -69,9 +71,9 @@ class LocalStore:
             write_file(file, data, tidy=False)
 
     def upload(self, folder: Path, name: str) -> list[str]:
-        """Copy the files of a local folder into the folder `name`. Return their names without the folder, in order.
+        """Copy the files of a local folder into the folder `name`. Return the sorted names of the files, without the folder.
 
-        StoreError if a file cannot be read or written. When this function returns, the files are on the disk, so a file that
+        StoreError if a file cannot be read or written. When this function returns, the files are on the disk. So a file that
         is written later may rely on them.
         """
         to = self._folder / name
@@ -93,10 +95,10 @@ class LocalStore:
 
 
 class LocalSource:
-    """The disk of this machine."""
+    """A source on the disk of this machine."""
 
     def expand(self, pattern: str) -> list[str]:
-        """Return the paths that a path or a glob pattern names, in order; none if nothing is there."""
+        """Return the sorted paths that a path or a glob pattern names. The list is empty if nothing is there."""
         path = Path(local_path(pattern))
         if os.path.lexists(path):
             return [str(path)]
@@ -104,7 +106,8 @@ class LocalSource:
         return sorted(str(found) for found in root.glob(str(path.relative_to(root))))
 
     def files(self, path: str) -> Mapping[str, FileState]:
-        """Return every file below a path, by its relative name. A path of a file gives this file, named ""."""
+        """Return the state of each file below a path, by the file's relative name. If the path is a file, its relative name
+        is ""."""
         root = Path(path)
         if root.is_file():
             return {"": _state(root)}
@@ -114,12 +117,12 @@ class LocalSource:
             below = PurePosixPath(Path(folder).relative_to(root).as_posix())
             for name in sorted(names):
                 file = Path(folder, name)
-                if file.is_file():  # A link to nothing is left out.
+                if file.is_file():  # A broken link is left out.
                     found[str(below / name)] = _state(file)
         return found
 
     def fetch(self, path: str, to: Path) -> Path:
-        """Return the path itself."""
+        """Return the path itself, because the log is already on this machine. `to` has no effect."""
         return Path(path)
 
 
@@ -130,7 +133,8 @@ def _state(file: Path) -> FileState:
 
 @contextmanager
 def _refusals() -> Iterator[None]:
-    """Turn the errors of writing files into StoreError: the log is not to blame, and a later try may succeed."""
+    """Raise StoreError in place of the errors of a write. The log does not cause such errors, and a later try may
+    succeed."""
     try:
         yield
     except OutputError as error:

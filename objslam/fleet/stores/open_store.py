@@ -1,4 +1,4 @@
-"""The store or source of a path or URL."""
+"""Open the store or the source at a path or URL."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ def is_remote(url: str) -> bool:
 
 
 def open_store(url: str) -> Store:
-    """Return the store at a path or URL. A URL has the errors of `open_filesystem`."""
+    """Return the store at a path or URL. For a remote URL, the errors are those of `open_filesystem`."""
     if is_remote(url):
         return RemoteStore(url)
     return LocalStore(local_path(url))
 
 
 def open_source(url: str) -> Source:
-    """Return the source that has a path or URL. The errors are as in `open_store`."""
+    """Return the source that can read a path or URL. The errors are those of `open_store`."""
     if is_remote(url):
         return RemoteSource(url)
     return LocalSource()

@@ -14,14 +14,17 @@ from objslam.errors import ConfigError, ObjslamError, first_line
 from objslam.fleet.stores.store import FileState, StoreError
 
 _TRIES = 5
-"""How often a call to a store is tried. A larger number survives longer faults, and reports a store that is gone later."""
+"""The maximum number of tries of a call to a store. With a larger number, a call survives longer faults, but the error for a
+store that never answers comes later."""
 _PAUSE = 0.1
-"""The pause after the first failure, s; it doubles after each further one. A larger value gives a busy store more rest."""
+"""The pause (s) after the first failed try of a call. The pause doubles after each further failed try. With a larger value,
+a busy store gets more rest."""
 _STAMPS = ("ETag", "etag", "md5Hash", "crc32c", "generation", "content_settings", "mtime", "LastModified", "created")
-"""The keys in fsspec's information on a file whose values change with its content, the most reliable first."""
-_MAGIC = re.compile(r"[*?\[]")  # The marks of a pattern.
+"""The keys of fsspec's file information whose values change with the content of the file. The most reliable key comes
+first."""
+_MAGIC = re.compile(r"[*?\[]")  # The characters that only glob patterns have.
 _SAFE = re.compile(r"(?!(.*/)?\.\.?(/|$))[^\0]*")
-"""The names of files that stay below their folder: no part of the name is "." or ".."."""
+"""The pattern of file names that stay below their folder. No part of such a name is "." or ".."."""
 
 _T = TypeVar("_T")
 
@@ -45,10 +48,10 @@ def open_filesystem(url: str) -> tuple[Any, str]:
 
 
 def persistent(call: Callable[[], _T], where: str) -> _T:
-    """Return what a call to a store returns, after up to `_TRIES` tries.
+    """Return what a call to a store returns. The call is tried up to `_TRIES` times.
 
-    where: the file, for messages. A FileNotFoundError is raised at once, and so is a StoreError if access is denied. After
-    the last try, any other OSError becomes a StoreError.
+    where: the name of the file for messages. FileNotFoundError if the file does not exist, and StoreError if access is
+    denied, both without another try. After the last try, any other OSError becomes a StoreError.
     """
     pause = _PAUSE
     for left in range(_TRIES - 1, -1, -1):
@@ -67,14 +70,15 @@ def persistent(call: Callable[[], _T], where: str) -> _T:
 
 
 class RemoteStore:
-    """A folder of an object store."""
+    """A store in a folder of an object store."""
 
     def __init__(self, url: str) -> None:
         self.url = url.rstrip("/")
         self._fs, self._root = open_filesystem(url)
 
     def names(self, prefix: str) -> list[str]:
-        """Return the names of the files directly in the folder `prefix`, without the folder, in order."""
+        """Return the sorted names of the files directly in the folder `prefix`, without the folder. A missing folder gives
+        []."""
         try:
             entries = self._try(prefix, lambda path: self._fs.ls(path, detail=True))
         except FileNotFoundError:
@@ -82,11 +86,12 @@ class RemoteStore:
         return sorted(str(one["name"]).rpartition("/")[2] for one in entries if one["type"] == "file")
 
     def read(self, name: str) -> bytes:
-        """Return the content of a file. FileNotFoundError if there is none, StoreError if the store does not answer."""
+        """Return the content of a file. FileNotFoundError if the file does not exist, StoreError if the store does not
+        answer."""
         return bytes(self._try(name, self._fs.cat_file))
 
     def read_many(self, names: Iterable[str]) -> dict[str, bytes]:
-        """Return the contents of files by name, read at the same time. Files that do not exist are left out."""
+        """Return the contents of files by name. The files are read in parallel. Files that do not exist are left out."""
         wanted = {self._at(name): name for name in names}
         found: dict[str, bytes] = {}
         answers = self._try("", lambda _: self._fs.cat(list(wanted), on_error="return")) if wanted else {}
@@ -105,7 +110,8 @@ class RemoteStore:
         self._try(name, lambda path: self._fs.pipe_file(path, data))
 
     def upload(self, folder: Path, name: str) -> list[str]:
-        """Copy the files of a local folder into the folder `name`. Return their names without the folder, in order."""
+        """Copy the files of a local folder into the folder `name`. Return the sorted names of the files, without the
+        folder."""
         names = sorted(file.name for file in folder.iterdir() if file.is_file())
         here, there = [str(folder / one) for one in names], [self._at(f"{name}/{one}") for one in names]
         self._parent(f"{name}/x")
@@ -123,7 +129,7 @@ class RemoteStore:
         return f"{self._root}/{name}" if name else self._root
 
     def _parent(self, name: str) -> None:
-        """Make the folder of a file. Object stores have no folders, and do nothing."""
+        """Make the folder of a file. The call has no effect on object stores, which have no folders."""
         self._try(name.rpartition("/")[0], lambda path: self._fs.makedirs(path, exist_ok=True))
 
     def _try(self, name: str, call: Callable[[str], _T]) -> _T:
@@ -131,14 +137,15 @@ class RemoteStore:
 
 
 class RemoteSource:
-    """The store that holds a URL, read only."""
+    """A source in the store that holds a URL. It only reads."""
 
     def __init__(self, url: str) -> None:
         self._scheme = url.partition("://")[0]
         self._fs = open_filesystem(url)[0]
 
     def expand(self, pattern: str) -> list[str]:
-        """Return the URLs that a URL or a glob pattern names, in order; none if nothing is there. ConfigError for `**`."""
+        """Return the sorted URLs that a URL or a glob pattern names. The list is empty if nothing is there. ConfigError if
+        the pattern contains `**`."""
         path = self._path(pattern)
         if "**" in path:
             raise ConfigError(f"** is not known in URLs: {pattern}", hint="name a folder, which is searched for logs")
@@ -153,13 +160,15 @@ class RemoteSource:
         return [self._url(one) for one in sorted(found) if first is not None or self._exists(one)]
 
     def files(self, path: str) -> Mapping[str, FileState]:
-        """Return every file below a URL, by its relative name. A URL of a file gives this file, named ""."""
+        """Return the state of each file below a URL, by the file's relative name. If the URL is a file, its relative name is
+        ""."""
         root = self._path(path)
         found = self._try(path, lambda: self._fs.find(root, detail=True)) if self._is_flat() else self._walk(root)
         return {str(name)[len(root) :].lstrip("/"): _state(info) for name, info in sorted(found.items())}
 
     def fetch(self, path: str, to: Path) -> Path:
-        """Copy a log into the folder `to`, and return the path of the copy. StoreError if a name leads out of the log."""
+        """Copy a log into the folder `to`, and return the path of the copy. StoreError if the name of a file leads out of
+        the log."""
         root = self._path(path)
         copy = to / root.rpartition("/")[2]
         names = list(self.files(path))
@@ -175,15 +184,16 @@ class RemoteSource:
     def _is_flat(self) -> bool:
         """Return whether the file system lists all files below a path in few calls, as object stores do.
 
-        Such a file system has a `find` of its own. The `find` of fsspec goes from folder to folder, and leaves out a folder
-        that fails.
+        Such a file system has its own `find`. The general `find` of fsspec lists folder by folder, and leaves out a folder
+        whose listing fails.
         """
         from fsspec.asyn import AsyncFileSystem
 
         return isinstance(self._fs, AsyncFileSystem) and type(self._fs)._find is not AsyncFileSystem._find
 
     def _walk(self, root: str) -> dict[str, Any]:
-        """Return every file below a path. Folders are listed one by one, and only a listing that fails is repeated."""
+        """Return the information on each file below a path, by the file's path. Folders are listed one by one. If a listing
+        fails, only this listing is repeated."""
         found, left = {}, [root]
         while left:
             for name, info in self._inside(left.pop()).items():
@@ -194,7 +204,8 @@ class RemoteSource:
         return found
 
     def _inside(self, folder: str) -> dict[str, Any]:
-        """Return the entries directly in a folder, by path. A file gives itself, and a missing path nothing."""
+        """Return the information on each entry directly in a folder, by the entry's path. If `folder` is a file, it is the
+        only entry. A missing path has no entries."""
         try:
             entries = self._try(folder, lambda: self._fs.ls(folder, detail=True))
         except FileNotFoundError:
@@ -203,7 +214,8 @@ class RemoteSource:
         return {name: one for name, one in named.items() if name != folder or one["type"] == "file"}
 
     def _exists(self, path: str) -> bool:
-        """Return whether something is at a path. The `exists` of fsspec also returns False if the store does not answer."""
+        """Return whether something is at a path. The `exists` of fsspec is not used, because it also returns False if the
+        store does not answer."""
         try:
             self._try(path, lambda: self._fs.info(path))
         except FileNotFoundError:

@@ -1,7 +1,8 @@
-"""The task of one log: read it, map it, and put its result into the store, whole or not at all.
+"""The task that maps one log. It reads the log, maps it, and puts the result into the store.
 
-The files of a result lie below its key, which is a hash of the log's content and the job. So a task that is run twice writes
-the same files. Nobody reads them before the record is there.
+The name of the folder of a result is the result's key, a hash of the log's content and the job. So a task that runs twice
+writes the same files. The record of a log is written last. Other tasks read a result only if its record exists, so they
+never use a part of a result.
 """
 
 from __future__ import annotations
@@ -31,16 +32,16 @@ if TYPE_CHECKING:
     from objslam.sources import SourceOptions
 
 WORK = "objslam.fleet.tasks.map_task:map_one"
-"""The name of the function of this task, for an engine."""
+"""The name by which an engine finds the function of this task."""
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """The part that the tasks of all logs of a fleet share.
+    """The data that the tasks of all logs of a fleet share.
 
-    store: the path or URL of the output. options: of the sources. digest: the hash of all that decides a result besides its
-    log. files: the path of each file, or its name in a remote store, by key. The key is a dotted setting, an option of
-    `OPTION_FILES`, or `detector`. report: whether to write the report of each log.
+    store: the path or URL of the output. options: the options of the sources. digest: the hash of everything that a result
+    depends on, except its log. files: the key of each file, and its path or its name in a remote store. A key is the dotted
+    key of a setting, the name of an option in `OPTION_FILES`, or `detector`. report: whether to write a report for each log.
     """
 
     store: str
@@ -53,8 +54,8 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class MapTask:
-    """One log of a job. task: the key of the log's fingerprint and the job (`seen_name`). again: whether to map the log
-    although an earlier run of the same content failed."""
+    """The task of mapping one log of a job. path: the path or URL of the log. task: the key of the log's fingerprint and the
+    job (`seen_name`). again: whether to map the log even if an earlier run failed on the same content."""
 
     job: Job
     path: str
@@ -63,10 +64,10 @@ class MapTask:
 
 
 def map_one(given: MapTask) -> Record:
-    """Map one log, and return its record. A log that cannot be mapped gives a record with its error.
+    """Map one log, and return its record. The record of a log that cannot be mapped has an error.
 
-    If the store already has the record of a log with the same content, this record is returned. It is made again only if it
-    has an error and `again` is set. StoreError if the store or the source does not answer.
+    If the store already has a record for the same content, this record is returned. Only a record with an error is made
+    again, and only if `again` is set. StoreError if the store or the source does not answer.
     """
     begin, cpu = time.monotonic(), time.process_time()
     store = open_store(given.job.store)
@@ -98,7 +99,8 @@ def map_one(given: MapTask) -> Record:
 
 
 def _mapped(given: MapTask, log: Path, out: Path, record: Record) -> Record:
-    """Map a log into the folder `out`, and return its record, completed from the summary."""
+    """Map a log, and write its result into the folder `out`. Return the record with the values of this result. log: the
+    local path. record: the record before the mapping."""
     from objslam.api.mapping import map_log
     from objslam.api.result import Result
     from objslam.core.diagnostics import Ledger
@@ -112,7 +114,7 @@ def _mapped(given: MapTask, log: Path, out: Path, record: Record) -> Record:
     path = found.robot_path
     mapped, found = map_log(found, settings, ledger, None, lambda stage, done, total: None)
     result = Result.of(mapped, found, detected=detector is not None)
-    result.summary["log_path"] = given.path  # The log may be a copy, which is deleted.
+    result.summary["log_path"] = given.path  # `log` may be a copy that is deleted later.
     result.save(out)
     if given.job.report:
         from objslam.output.report.page import write_report
@@ -152,7 +154,8 @@ def _said(result: Result) -> dict[str, Any]:
 
 
 def _inputs(job: Job) -> tuple[Settings, SourceOptions, Path | None]:
-    """Return the settings and the options of a job with local paths, and its detector."""
+    """Return the settings and the source options of a job, with local paths of their files. Also return the path of the
+    detector, None without one."""
     from objslam.config.settings import change_settings
 
     local = {key: _local_file(job.store, name) for key, name in job.files}
@@ -164,7 +167,7 @@ def _inputs(job: Job) -> tuple[Settings, SourceOptions, Path | None]:
 
 @lru_cache(maxsize=16)
 def _local_file(store: str, name: str) -> Path:
-    """Return a file of a job on this machine. A file of a remote store is copied once by each process."""
+    """Return the local path of a file of a job. Each process copies a file of a remote store once."""
     if not is_remote(store):
         return Path(name)
     from objslam.detection import default_cache

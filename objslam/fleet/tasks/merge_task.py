@@ -1,6 +1,6 @@
-"""The task of one node of the tree of a site: merge the sessions, or the two parts, below the node.
+"""The task that merges one node of the tree of a site. It merges a group of sessions, or the islands of two nodes.
 
-An island is a group of sessions that have objects in common, and so one map. A node may have several islands.
+An island is a group of sessions that share objects. It has one map. A node may have several islands.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
     from objslam.mapping.sites.session import Session, Visit
 
 WORK = "objslam.fleet.tasks.merge_task:merge_one"
-"""The name of the function of this task, for an engine."""
+"""The name by which an engine finds the function of this task."""
 _SESSION_FILES = (files.OBJECTS, files.VIEWS, files.RAYS)
-"""The files of a result that a merge reads."""
+"""The names of the files of a result that a merge reads."""
 
 
 @dataclass(frozen=True, slots=True)
 class MergeTask:
-    """The merge at one node of the tree of a site. store: the URL of the output."""
+    """The task of merging one node of the tree of a site. store: the path or URL of the output."""
 
     store: str
     node: Node
@@ -45,11 +45,13 @@ class MergeTask:
 
 @dataclass(frozen=True)
 class Placed:
-    """A session in the frame of its island.
+    """The pose of a session in the frame of its island.
 
-    key: the key of its result. covariance: (4, 4) of x, y, z (m) and yaw (rad). log_odds: the evidence for its place among
-    the earlier sessions, NaN for the first. The first session of a merged part has the evidence for the whole part. common:
-    how many of its objects other sessions share, counted in the first merge that finds any.
+    key: the key of the session's result. site_T_session: (4, 4) the pose, m. covariance: (4, 4) the covariance of x, y, z
+    (m) and yaw (rad) of the pose. log_odds: the log odds of the registration that joined the session to earlier sessions,
+    NaN for the first session of the island. If a part with several sessions was joined, the first session of the part has
+    these log odds. The other sessions of the part keep their own. common: the number of the session's objects that other
+    sessions found too, counted in the first merge that finds any.
     """
 
     key: str
@@ -61,7 +63,8 @@ class Placed:
 
 @dataclass(frozen=True)
 class SiteMap:
-    """One island of a node. sessions: in the order of time; the first gives the frame."""
+    """One island of a node. objects: its map. sessions: its sessions in the order of time. The first session gives the frame
+    of the map."""
 
     objects: ObjectMap
     sessions: tuple[Placed, ...]
@@ -70,7 +73,7 @@ class SiteMap:
 def merge_one(given: MergeTask) -> int:
     """Merge the node of a task, and write it into the store. Return the number of its islands.
 
-    OutputError or StoreError if a result or a node below it is damaged, StoreError if the store does not answer.
+    OutputError or StoreError if a result or a node below this node is damaged, StoreError if the store does not answer.
     """
     from objslam.mapping.sites.merge import merge_sessions
 
@@ -90,7 +93,8 @@ def merge_one(given: MergeTask) -> int:
 
 
 def load_node(store: Store, key: str) -> list[SiteMap]:
-    """Return the islands of a node. StoreError if its file is missing or damaged, OutputError if an object is invalid."""
+    """Return the islands of a node. key: the key of the node. StoreError if the node's file is missing or damaged,
+    OutputError if an object is invalid."""
     from objslam.io.objects_json import parse_objects
 
     try:
@@ -105,7 +109,8 @@ def load_node(store: Store, key: str) -> list[SiteMap]:
 
 
 def load_session(store: Store, folder: Path, key: str) -> Session:
-    """Return the session of a key. folder: gets the files, if the store is remote."""
+    """Return the session of a result. key: the key of the result. folder: a local folder for copies of the files of a remote
+    store."""
     from objslam.mapping.sites.session import Session
 
     with _result_folder(store, folder, key) as at:
@@ -114,7 +119,7 @@ def load_session(store: Store, folder: Path, key: str) -> Session:
 
 @contextmanager
 def _result_folder(store: Store, folder: Path, key: str) -> Iterator[Path]:
-    """Yield a folder of this machine with the files of a result that a merge reads."""
+    """Yield a local folder with the files of a result that a merge reads. folder, key: as in `load_session`."""
     if isinstance(store, LocalStore):
         yield Path(store.url, result_name(key))
         return
@@ -126,7 +131,8 @@ def _result_folder(store: Store, folder: Path, key: str) -> Iterator[Path]:
 
 
 def _session(part: SiteMap, load: Any) -> Session:
-    """Return an island as a session of the next merge. Its sessions are loaded only if an object may have been missed."""
+    """Return an island as one session of the next merge. load: a function that returns the session of a key. The sessions of
+    the island are loaded only if the merge needs to know whether they missed an object."""
     from objslam.core.geometry import inverse
     from objslam.mapping.sites.session import Session, Visit
 
@@ -137,16 +143,18 @@ def _session(part: SiteMap, load: Any) -> Session:
 
 
 def _alone(key: str) -> SiteMap:
-    """Return a session that no merge placed yet, in its own frame. It has no objects: a merge reads them from the result."""
+    """Return one session as an island in the session's own frame. key: the key of the session's result. The island has no
+    objects, because the merge reads the objects from the result."""
     from objslam.core.object_map import ObjectMap
 
     return SiteMap(ObjectMap(()), (Placed(key, np.eye(4), np.zeros((4, 4)), np.nan, 0),))
 
 
 def _joined(island: Island, parts: Sequence[SiteMap], order: Sequence[str]) -> SiteMap:
-    """Return an island of a merge with all sessions below it.
+    """Return an island of a merge with all sessions that it contains.
 
-    parts: what was merged, by the numbers in `island.sessions`. order: the keys of the sessions, in the order of time.
+    parts: the islands that were merged. `island.sessions` has indices into them. order: the keys of the sessions of all
+    parts, in the order of time.
     """
     rank = {key: number for number, key in enumerate(order)}
     placed = []
@@ -168,8 +176,8 @@ def _joined(island: Island, parts: Sequence[SiteMap], order: Sequence[str]) -> S
 def _compound(site_T_part: Floats, covariance: Floats, one: Placed) -> Floats:
     """Return the covariance (4, 4), of x, y, z (m) and yaw (rad), of the pose of a session in the site.
 
-    site_T_part (4, 4), covariance (4, 4): the pose of its part in the site. one: the session in the part. An error of the
-    part's yaw turns the session around the origin of the part.
+    site_T_part, covariance: (4, 4) the pose of the session's part in the site, and the covariance of this pose. one: the
+    pose of the session in the part. An error of the part's yaw turns the session around the origin of the part.
     """
     turn = np.eye(4)
     turn[:3, :3] = site_T_part[:3, :3]

@@ -1,4 +1,5 @@
-"""The last task of a site: its folder, as `objslam merge` writes it, and its part of the tables."""
+"""The last task of a site. It writes the folder of the site, as `objslam merge` does, and the part of the tables for the
+site."""
 
 from __future__ import annotations
 
@@ -24,20 +25,21 @@ if TYPE_CHECKING:
     from objslam.mapping.sites.merge import Island
 
 WORK = "objslam.fleet.tasks.site_task:finish_site"
-"""The name of the function of this task, for an engine."""
+"""The name by which an engine finds the function of this task."""
 SITES = "sites"
-"""The folder of the sites in the store."""
+"""The name of the folder in the store that contains the folders of all sites."""
 _STATE = "fleet.json"
-"""The file of a site that says what its folder and its tables were made of."""
+"""The name of a file in the folder of a site. The file says from which sessions the folder and the tables of the site were
+made."""
 _OBJECTS, _SESSIONS = "objects.parquet", "sessions.parquet"
-"""The folders of the tables, with one file for each site and day."""
+"""The names of the folders of the two tables. Each folder has one file for each site and day."""
 _FILE = "part-0.parquet"  # The name of each file of a table.
 
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """A session of a site. key: the key of its result. path: where its log is. begin: its first stamp, s. digest: the hash
-    of its job."""
+    """A session of a site. key: the key of its result. path: the path or URL of its log. robot, day: the names of its robot
+    and its day. begin: the first stamp of its path, s. digest: the hash of its job."""
 
     key: str
     path: str
@@ -49,7 +51,8 @@ class Member:
 
 @dataclass(frozen=True, slots=True)
 class SiteTask:
-    """A site whose tree is merged. root: the key of its last node. price: of an hour of one core, NaN if unknown."""
+    """The task of finishing a site whose tree is merged. store: the path or URL of the output. root: the key of the root of
+    the tree. members: the sessions in the order of time. price: the price of one hour of one core, NaN if unknown."""
 
     store: str
     site: str
@@ -60,8 +63,8 @@ class SiteTask:
 
 @dataclass(frozen=True, slots=True)
 class SiteResult:
-    """The counts of a site. islands, sessions: all of them. objects, gone: the present and the gone objects of the largest
-    island. changed: whether this run wrote the site."""
+    """The counts of a site. islands, sessions: the numbers of all its islands and sessions. objects, gone: the numbers of
+    present and of gone objects in the largest island. changed: whether this run wrote the site."""
 
     site: str
     islands: int
@@ -72,14 +75,14 @@ class SiteResult:
 
 
 def folder_of(name: str) -> str:
-    """Return the name of a folder, or the value of a partition, for a site or a day."""
+    """Return a valid folder name for the name of a site or a day. Tables also use it as the value of a partition."""
     text = quote(name, safe=" ,;=()+-_~!'&$@")
     return text if text.strip(".") else text.replace(".", "%2E") or "_"
 
 
 def finish_site(given: SiteTask) -> SiteResult:
-    """Write the folder of a site, and the tables of its days that changed. Raises the errors of `load_node` and of the
-    store."""
+    """Write the folder of a site, and the tables of those days that changed. Return the counts of the site. Raises the
+    errors of `load_node` and of the store."""
     store = open_store(given.store)
     islands = load_node(store, given.root)
     at = f"{SITES}/{folder_of(given.site)}"
@@ -98,12 +101,13 @@ def finish_site(given: SiteTask) -> SiteResult:
 
 
 def state_name(site: str) -> str:
-    """Return the name of the file (`_STATE`) that says what a site was made of."""
+    """Return the name in the store of the file `_STATE` of a site."""
     return f"{SITES}/{folder_of(site)}/{_STATE}"
 
 
 def earlier_members(state: bytes | None, digest: str) -> list[Member]:
-    """Return the sessions that a site has from earlier runs of a job, by the content of its `state_name`."""
+    """Return the sessions of a site from earlier runs of the same job. state: the content of the site's file `state_name`,
+    None if there is no such file. digest: the hash of the job."""
     try:
         members = [Member(**one) for one in _parse_state(state).get("members", [])]
     except TypeError:  # Another version wrote the file.
@@ -112,9 +116,10 @@ def earlier_members(state: bytes | None, digest: str) -> list[Member]:
 
 
 def as_before(given: SiteTask, state: bytes | None) -> SiteResult | None:
-    """Return the site as an earlier run wrote it, if that run had the same sessions and price. None if its task must run.
+    """Return the counts of a site that an earlier run wrote from the same sessions and price. Return None if there is no
+    such run.
 
-    state: the content of its `state_name`, None if there is none.
+    state: the content of the site's file `state_name`, None if there is no such file.
     """
     said = _parse_state(state)
     return _result(given.site, said, changed=False) if said.get("made_of") == _made_of(given) else None
@@ -131,7 +136,7 @@ def _result(site: str, said: Mapping[str, Any], *, changed: bool) -> SiteResult:
 
 
 def _parse_state(data: bytes | None) -> dict[str, Any]:
-    """Return what the file of a site says, nothing if it is missing or damaged."""
+    """Return the content of the file `state_name` of a site. It is empty if the file is missing or damaged."""
     try:
         said = json.loads(data or b"{}")
     except ValueError:
@@ -140,7 +145,8 @@ def _parse_state(data: bytes | None) -> dict[str, Any]:
 
 
 def _write_folder(store: Store, given: SiteTask, islands: Sequence[SiteMap], at: str, before: int) -> None:
-    """Write the site as `objslam merge` does, and the map as a table. before: the number of islands in the earlier run."""
+    """Write the folder `at` of a site as `objslam merge` does, and the objects of the site as a table. before: the number of
+    islands in the earlier run. The files of islands that no longer exist are deleted."""
     from objslam.fleet.tables import dump_objects, object_rows
     from objslam.output.site_folder import write_site
 
@@ -161,7 +167,7 @@ def _write_folder(store: Store, given: SiteTask, islands: Sequence[SiteMap], at:
 
 
 def _seal_last(store: Store, folder: Path, at: str) -> None:
-    """Upload the folder of an island. Its summary.json goes last, because it marks a whole result."""
+    """Upload the folder of an island. Write its summary.json last, because this file shows that the folder is complete."""
     seal = (folder / SUMMARY).read_bytes()
     (folder / SUMMARY).unlink()
     store.upload(folder, at)
@@ -184,9 +190,9 @@ def _island(found: SiteMap, order: Mapping[str, int]) -> Island:
 
 
 def _write_tables(store: Store, given: SiteTask, islands: Sequence[SiteMap], before: Mapping[str, str]) -> dict[str, str]:
-    """Write the tables of the days that changed, and remove the tables of days that are gone.
+    """Write the tables of the days that changed, and remove the tables of days that no longer have a session.
 
-    Return for each day a hash of the data in its files. before: these hashes from the earlier run.
+    Return for each day a hash of the data in its files. before: the hashes that the earlier run returned.
     """
     placed = {one.key: (number + 1, one) for number, island in enumerate(islands) for one in island.sessions}
     days: dict[str, list[Member]] = {}

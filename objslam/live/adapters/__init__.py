@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from objslam.live.ros.topic_discovery import TopicChoice
 
 ODOM = "odom"  # The name of the odometry's frame where messages do not name it (REP 105).
-_INTERFACE = "DDS: a network interface, by name or address, or auto for any. [default: from CYCLONEDDS_URI, else loopback]"
+_INTERFACE = "DDS: a network interface, by name or address, or auto for any. Default: from CYCLONEDDS_URI, else loopback."
 
 
 Wait = Callable[[], object]
@@ -59,7 +59,7 @@ class LiveRosOptions(RosOptions):
 class NetworkOptions:
     """The arguments of `live.dds.network.open_network`."""
 
-    domain: Annotated[int | None, Option("--domain", "DDS domain. [default: ROS_DOMAIN_ID, else 0]")] = None
+    domain: Annotated[int | None, Option("--domain", "DDS domain. Default: ROS_DOMAIN_ID, else 0.")] = None
     interface: Annotated[str | None, Option("--interface", _INTERFACE)] = None
 
 

@@ -20,7 +20,7 @@ _OPS = _MESSAGE, _BAG_HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = b"\x02"
 _OP_FIELD = re.compile(rb"\x04\x00\x00\x00op=[\x02\x04\x05\x06\x07]")
 _MAX_HEADER = 1 << 16  # The length limit of a record header, bytes. A longer header counts as damage.
 _MAX_SEARCHED_HEADER = 512  # The longest header that the search after damage finds, bytes. A larger value slows the search.
-_BLOCK = 1 << 20  # The number of bytes read at once, a compromise between few reads and little memory.
+_BLOCK = 1 << 20  # The number of bytes that are read at once. With a larger number, reads are fewer and take more memory.
 _U32 = struct.Struct("<I")
 _TIME = struct.Struct("<II")
 _Fields = dict[bytes, bytes]
@@ -40,7 +40,7 @@ class _Reading(Reading):
 
 
 def read_bag1(path: Path, report: FileReport, wanted: Wanted) -> Messages:
-    """Yield the wanted messages of a bag in file order. A bag may be damaged or unclosed. `report` lists missing parts."""
+    """Yield the wanted messages of a bag in file order. The bag may be damaged or unclosed. `report` gets its damage."""
     with path.open("rb", buffering=_BLOCK) as file:
         end = os.fstat(file.fileno()).st_size
         reading = _Reading(report, wanted)
@@ -50,8 +50,8 @@ def read_bag1(path: Path, report: FileReport, wanted: Wanted) -> Messages:
 
 
 def _walk(stream: BinaryIO, at: int, end: int, reading: _Reading, chunks: bool = True) -> Messages:
-    """Yield the wanted messages from byte `at` to byte `end` of a file, or of an unpacked chunk.
-    chunks: whether the records may include chunks. An unpacked chunk never contains chunks."""
+    """Yield the wanted messages from byte `at` to byte `end` of a stream. The stream is a file or an unpacked chunk.
+    chunks: whether the stream may contain chunks. An unpacked chunk never contains chunks."""
     report = reading.report
     while at < end:
         stream.seek(at)
@@ -113,7 +113,8 @@ def _unpack_chunk(
 
 
 def _read_header(stream: BinaryIO, at: int, end: int) -> tuple[bytes, _Fields, int, int] | None:
-    """Return operation, fields, data start and data size of the record at byte `at`, None if the record is not valid."""
+    """Return the operation, the fields, the data start (byte) and the data size (bytes) of the record at byte `at`.
+    Return None if the record is not valid."""
     size = int.from_bytes(stream.read(4), "little")
     if not 0 < size <= _MAX_HEADER:
         return None
@@ -130,7 +131,7 @@ def _read_header(stream: BinaryIO, at: int, end: int) -> tuple[bytes, _Fields, i
 
 
 def _parse_fields(header: bytes) -> _Fields | None:
-    """Return the values of a header by field name, None if the header is malformed."""
+    """Return the values of a header by field name, or None if the header is malformed."""
     fields = {}
     at = 0
     while at < len(header):
@@ -144,13 +145,13 @@ def _parse_fields(header: bytes) -> _Fields | None:
 
 
 def _number(fields: _Fields, name: bytes) -> int:
-    """Return the unsigned number in the header field `name`, -1 if the field is missing."""
+    """Return the unsigned number in the header field `name`, or -1 if the field is missing."""
     value = fields.get(name)
     return -1 if value is None else int.from_bytes(value, "little")
 
 
 def _find_record(stream: BinaryIO, at: int, end: int) -> int | None:
-    """Return the byte where the next plausible record header starts, None if there is none."""
+    """Return the byte where the next plausible record header starts, or None if no such header follows."""
     while at < end:
         stream.seek(at)
         block = stream.read(_BLOCK + _MAX_SEARCHED_HEADER)

@@ -1,4 +1,4 @@
-"""Decompression with a size limit. It also recovers the readable part of cut-off data."""
+"""Unpack compressed data up to a size limit, and recover the readable part of data that are cut off."""
 
 import io
 from collections.abc import Iterator
@@ -12,14 +12,14 @@ _PIECE = 1 << 22  # The largest piece that is unpacked at once, bytes. A larger 
 
 
 class CorruptDataError(ValueError):
-    """The data cannot be unpacked, for the reason in the message."""
+    """The error for data that cannot be unpacked. Its message gives the reason."""
 
 
 def unpack(data: bytes, method: str, *, cut: bool = False) -> bytes:
-    """Return the data unpacked by `method`, which is "" or "none", "bz2", "lz4" (frame format) or "zstd".
+    """Return the unpacked data. method: "bz2", "lz4" (frame format), "zstd", or "" or "none" for data that are not packed.
 
-    Raises CorruptDataError for an unknown method, excessive size or broken data. With `cut`, broken data are returned as far
-    as they can be unpacked.
+    Raises CorruptDataError if the method is unknown, the unpacked size is above `MAX_RECORD`, or the data are broken. If
+    `cut` is True, broken data raise no error, and the part before the damage is returned.
     """
     if method in ("", "none"):
         return data
@@ -42,7 +42,7 @@ def unpack(data: bytes, method: str, *, cut: bool = False) -> bytes:
 
 
 def unpack_file(source: Path, target: Path, limit: int) -> str | None:
-    """Unpack a zstd file to `target`. Return the reason for an early stop, None if the whole file is unpacked.
+    """Unpack a zstd file to `target`. Return the reason for an early stop, or None if the whole file was unpacked.
 
     limit: the largest unpacked size, bytes. The part that was unpacked before the stop stays in `target`.
     """

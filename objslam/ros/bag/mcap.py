@@ -24,8 +24,9 @@ _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _CHUNK_HEAD = struct.Struct("<QQQI")
 _U16, _U32, _U64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 _CHUNK_START = re.compile(rb"\x06.{5}\0\0\0.{21}\0\0\0.{4}(\0\0\0\0|\x03\0\0\0lz4|\x04\0\0\0zstd).{5}\0\0\0", re.DOTALL)
-"""The head of a chunk record: length, two timestamps, unpacked size, CRC, compression, packed size. Sizes are below 2^40."""
-_BLOCK = 1 << 20  # The number of bytes read at once, a compromise between few reads and little memory.
+"""The pattern of the head of a chunk record: length, two timestamps, unpacked size, CRC, compression, packed size. The
+pattern finds only chunks of less than 2^40 bytes."""
+_BLOCK = 1 << 20  # The number of bytes that are read at once. With a larger number, reads are fewer and take more memory.
 _LATEST = 2**63 - 1  # The largest recording time that a signed 64-bit integer holds, ns.
 
 
@@ -35,7 +36,7 @@ class _Reading(Reading):
 
 
 def read_mcap(path: Path, report: FileReport, wanted: Wanted) -> Messages:
-    """Yield the wanted messages of an MCAP file in file order. `report` lists missing parts.
+    """Yield the wanted messages of an MCAP file in file order. `report` gets the damage of the file.
 
     The file may be damaged or unclosed. A cut-off last chunk is read as far as it can be unpacked. A chunk with a wrong CRC
     is skipped.
@@ -151,7 +152,8 @@ def _strings(data: bytes, at: int, count: int) -> Iterator[str]:
 
 
 def _unpack_chunk(data: bytes, cut: bool = False) -> bytes:
-    """Return the unpacked records of a chunk. With `cut`, return the part of them that can be unpacked."""
+    """Return the unpacked records of a chunk. If `cut` is True, return the part of the records that can be unpacked.
+    Raises CorruptDataError if the chunk is broken."""
     try:
         _, _, size, crc = _CHUNK_HEAD.unpack_from(data)
         (method,) = _strings(data, _CHUNK_HEAD.size, 1)
@@ -172,7 +174,7 @@ def _unpack_chunk(data: bytes, cut: bool = False) -> bytes:
 
 
 def _find_chunk(file: BinaryIO, at: int, end: int) -> int | None:
-    """Return the byte where the next whole chunk with consistent sizes starts, None if there is none."""
+    """Return the byte where the next whole chunk with consistent sizes starts, or None if no such chunk follows."""
     while at < end:
         file.seek(at)
         block = file.read(_BLOCK + 64)

@@ -26,7 +26,9 @@ _FORMATS = {
 _METADATA = "metadata.yaml"
 _MAX_METADATA = 16 << 20  # The size limit of metadata.yaml, bytes. The limit bounds memory.
 _MAX_FILE = 256 << 30  # The size limit of an unpacked file, bytes. The limit bounds disk use.
-_MAX_RATIO = 1000  # The largest ratio of unpacked to packed size. 1 GiB is always allowed. No recording has a larger ratio.
+_MAX_RATIO = 1000
+"""The largest allowed ratio of a file's unpacked size to its packed size. No recording has a larger ratio. An unpacked size
+of up to 1 GiB is always allowed."""
 _SPLIT = re.compile(r"(.*?)[-_]?(\d+)?((?:\.bag|\.mcap|\.db3|\.active|\.zstd)+)")
 
 
@@ -41,7 +43,7 @@ class BagFile:
 
 @dataclass(frozen=True)
 class Recording:
-    """The files of one recording in order. expected: the message count of metadata.yaml, None if unknown."""
+    """The files of one recording in order. expected: the message count in metadata.yaml, or None if it is unknown."""
 
     name: str
     files: tuple[BagFile, ...]
@@ -49,7 +51,7 @@ class Recording:
 
     @property
     def format(self) -> str:
-        """The names of the file formats."""
+        """The names of the file formats, separated by commas."""
         return ", ".join(dict.fromkeys(_FORMATS[file.kind][0] for file in self.files))
 
 
@@ -63,8 +65,8 @@ def find_recording(paths: Path | Sequence[Path], ledger: Ledger) -> Recording:
 
     Several files are read in the given order. The metadata.yaml of a folder lists its files. Listed files that are missing
     or outside the folder are counted as drops. Files that metadata.yaml does not list are left out with a warning. A killed
-    recorder writes no metadata.yaml. Without it, the file names may differ only in the number before the suffix. Raises
-    LogError if there is no recording, or if a folder has more than one.
+    recorder writes no metadata.yaml. The names of the files in such a folder may differ only in the number before the
+    suffix. Raises LogError if there is no recording, or if a folder has more than one recording.
     """
     paths = [paths] if isinstance(paths, Path) else list(paths)
     if not paths:
@@ -88,7 +90,7 @@ def read_messages(recording: Recording, wanted: Wanted, reports: list[FileReport
     """Yield the messages of the wanted topics, file by file, and append a report on each file to `reports`.
 
     An unreadable file is reported and skipped. If metadata.yaml counts more messages than the files have, a last report
-    counts the missing ones. Raises LogError if no file can be read.
+    counts the missing messages. Raises LogError if no file can be read.
     """
     refused: list[LogError] = []
     for file in recording.files:
@@ -118,7 +120,7 @@ def read_messages(recording: Recording, wanted: Wanted, reports: list[FileReport
 
 
 def _bag_file(path: Path) -> BagFile | None:
-    """Return the bag file at a path, None for another file. If the suffix is unknown, the first bytes decide."""
+    """Return the bag file at a path, or None if the file is no bag. If the suffix is unknown, the first bytes decide."""
     suffixes = [suffix for suffix in path.suffixes if suffix != ".active"]
     packed = bool(suffixes) and suffixes[-1] == ".zstd"
     suffix = suffixes[-2 if packed else -1] if len(suffixes) > packed else ""
@@ -135,7 +137,7 @@ def _bag_file(path: Path) -> BagFile | None:
 
 
 def _split(path: Path) -> tuple[str, int]:
-    """Return a file name without its number and suffixes, and the number, -1 if the name has none."""
+    """Return a file name without its number and suffixes, and this number. The number is -1 if the name has no number."""
     match = _SPLIT.fullmatch(path.name)
     return (match[1], int(match[2] or -1)) if match else (path.name, -1)
 
@@ -179,8 +181,8 @@ def _read_metadata(file: Path, ledger: Ledger) -> dict[str, Any]:
 
 
 def _listed(metadata: dict[str, Any], here: list[str], ledger: Ledger) -> list[str]:
-    """Return the listed file names that `here` contains. Of a listed path, only the file name counts, because old
-    metadata also name the folder."""
+    """Return the file names that the metadata list and `here` contains. Only the file name of a listed path counts,
+    because old metadata files also name the folder."""
     names = []
     given = metadata.get("relative_file_paths")
     for entry in given if isinstance(given, list) else []:

@@ -5,14 +5,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 MAX_RECORD = 256 << 20  # The size limit of a record, chunk or message, packed or unpacked, bytes. The limit bounds memory.
-LANGUAGES = {"ros2msg": "msg", "ros1msg": "msg", "ros2idl": "idl"}  # The definition language by its name in bags.
-MAX_NAME = 256  # The length limit of a topic or frame name, characters. The limit keeps messages readable.
+LANGUAGES = {"ros2msg": "msg", "ros1msg": "msg", "ros2idl": "idl"}  # The language of a definition, by its name in bags.
+MAX_NAME = 256  # The length limit of a topic or frame name, characters. The limit keeps printed texts readable.
 _TYPE = re.compile(r"([A-Za-z]\w*)/(?:(?:msg|action|srv)/)?([A-Za-z]\w*)", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """A topic as one file describes it."""
+    """The description of a topic in one file."""
 
     topic: str
     type: str  # The message type in ROS 2 form, package/msg/Name.
@@ -21,24 +21,25 @@ class Connection:
     language: str = "msg"  # The language of the definition, "msg" or "idl".
 
 
-Messages = Iterator[tuple[Connection, int, bytes]]  # Each tuple has connection, recording time (ns) and message bytes.
-Wanted = Callable[[Connection], bool]  # The function returns whether the caller wants the messages of a connection.
+Messages = Iterator[tuple[Connection, int, bytes]]  # Messages, each as connection, recording time (ns) and message bytes.
+Wanted = Callable[[Connection], bool]  # A function that returns whether the caller wants the messages of a connection.
 
 
 @dataclass
 class FileReport:
-    """The result of reading one file. of_folder: whether it is about the messages that no file of a folder has instead."""
+    """The result of reading one file. of_folder: True if the report is about a folder instead. Such a report counts the
+    messages that no file of the folder has."""
 
     file: str
     messages: int = 0  # The number of messages read.
     lost: int = 0  # The number of messages known to be lost.
-    expected: int | None = None  # The message count that the file states, None if unknown.
+    expected: int | None = None  # The message count that the file states, or None if it states no count.
     complete: bool = True  # False if an unknown number of messages is lost.
     problems: list[str] = field(default_factory=list)  # One text per kind of damage.
     of_folder: bool = False
 
     def damage(self, problem: str, lost: int | None = None) -> None:
-        """Add damage of the kind `problem`. lost: the number of messages that this damage lost, None if unknown."""
+        """Add damage of the kind `problem`. lost: the number of messages lost by this damage, or None if it is unknown."""
         if problem not in self.problems:
             self.problems.append(problem)
         if lost is None:
@@ -47,9 +48,9 @@ class FileReport:
             self.lost += lost
 
     def close(self) -> None:
-        """Compare the messages read with the count that the file states, if any.
+        """Finish the report. If the file states a message count, update `lost` and `complete`.
 
-        Then `lost` is at least the stated count minus the messages read, and `complete` is True.
+        `lost` becomes at least the stated count minus the number of messages read. `complete` becomes True.
         """
         if self.expected is not None:
             self.lost = max(self.lost, self.expected - self.messages)
@@ -70,8 +71,9 @@ class FileReport:
 class Reading:
     """The state of reading a file of chunks. In the file, the index of a chunk comes after the chunk.
 
-    connections: by their number in the file. chunk_read, chunk_indexed: how many messages of the current chunk were read,
-    and how many its index lists. chunk_problem: why the chunk cannot be read, "" if it can.
+    connections: the connections by their number in the file. chunk_read: the number of messages read from the current
+    chunk. chunk_indexed: the number of messages that the chunk's index lists. chunk_problem: the reason why the chunk
+    cannot be read, or "" if it can be read.
     """
 
     report: FileReport
@@ -82,14 +84,14 @@ class Reading:
     chunk_problem: str = ""
 
     def end_chunk(self) -> None:
-        """Report the current chunk if it is broken, and reset the state for the next chunk."""
+        """Report the current chunk if it cannot be read, and reset the state for the next chunk."""
         if self.chunk_problem:
             self.report.damage(self.chunk_problem, self.chunk_indexed - self.chunk_read if self.chunk_indexed else None)
         self.chunk_read, self.chunk_indexed, self.chunk_problem = 0, 0, ""
 
 
 def plain(name: str) -> str:
-    """Return a topic or frame name with unprintable characters replaced, cut to `MAX_NAME` characters."""
+    """Return a topic or frame name, cut to `MAX_NAME` characters. Unprintable characters are replaced."""
     if len(name) <= MAX_NAME and name.isprintable():
         return name
     return "".join(c if c.isprintable() else "\ufffd" for c in name[:MAX_NAME])
@@ -101,7 +103,7 @@ def frame_name(frame_id: str) -> str:
 
 
 def type_name(name: str) -> str:
-    """Return a message type in ROS 2 form, such as nav_msgs/msg/Odometry. Other text is returned as `plain` text."""
+    """Return a message type in ROS 2 form, such as nav_msgs/msg/Odometry. Any other text is only cleaned by `plain`."""
     match = _TYPE.fullmatch(name)
     return f"{match[1]}/msg/{match[2]}" if match else plain(name)
 

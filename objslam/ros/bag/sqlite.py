@@ -18,7 +18,8 @@ MAGIC = b"SQLite format 3\0"
 def read_sqlite(path: Path, report: FileReport, wanted: Wanted) -> Messages:
     """Yield the messages of the wanted topics in rowid order. Raises LogError if the file is not a database of messages.
 
-    All whole rows of a damaged file are read. A killed recorder leaves a journal, which is applied to a temporary copy.
+    All whole rows of a damaged file are read. A killed recorder leaves a journal of SQLite beside the file. This journal is
+    applied to a temporary copy of the file.
     """
     with _settled(path, report) as (file, mode), _open(file, mode, path) as database:
         topics = _read_topics(database, path)
@@ -33,7 +34,8 @@ def read_sqlite(path: Path, report: FileReport, wanted: Wanted) -> Messages:
 
 @contextmanager
 def _settled(path: Path, report: FileReport) -> Iterator[tuple[Path, str]]:
-    """Yield the file to read and its open mode. The file is a temporary copy if a killed recorder left a journal."""
+    """Yield the file to read, and the mode in which SQLite opens it. If a killed recorder left a journal of SQLite, the
+    file is a temporary copy."""
     names = (path.with_name(path.name + end) for end in ("-wal", "-journal"))
     siblings = [file for file in names if file.is_file() and file.stat().st_size]
     if not siblings:
@@ -88,9 +90,9 @@ def _read_topics(database: sqlite3.Connection, path: Path) -> dict[int, Connecti
 def _rows(
     database: sqlite3.Connection, file: Path, topics: frozenset[int], report: FileReport
 ) -> Iterator[tuple[int, int, Any, Any]]:
-    """Yield the rows of the topics in rowid order: rowid, topic id, time of recording (ns) and message.
+    """Yield the rows of the topics in rowid order. A row is rowid, topic id, recording time (ns) and message.
 
-    A cut-off file is read page by page. After a failure of the database, the rest of the file is read page by page too.
+    A cut-off file is read page by page. If the database fails, the rest of the file is read page by page.
     """
     marks = ", ".join("?" * len(topics))
     last = -1

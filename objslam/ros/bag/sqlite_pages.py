@@ -1,6 +1,7 @@
 """Find the rows of a damaged SQLite file page by page. The rows of a leaf page survive the loss of the tree above it.
 
-https://www.sqlite.org/fileformat2.html, sections 1.3 (header), 1.6 (b-tree pages, cells, overflow), 2.1 (records).
+The file format is described in https://www.sqlite.org/fileformat2.html. The sections used are 1.3 (header), 1.6 (b-tree
+pages, cells, overflow) and 2.1 (records).
 """
 
 import mmap
@@ -16,15 +17,18 @@ from objslam.ros.bag.records import MAX_RECORD
 Row = tuple[int, int, int, bytes]  # Each row is a tuple of rowid, topic id, recording time (ns) and message.
 _LEAF = 13  # The type byte of a table leaf page.
 _INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}  # The size of an integer by its serial type, bytes.
-_MAX_COLUMNS = 32  # The column limit of a messages table. A cell with more columns is not a message.
+_MAX_COLUMNS = 32  # The largest number of columns in a table of messages. A cell with more columns is not a message.
 
 
 class _CellError(ValueError):
-    """A cell is incomplete or is not a row of messages."""
+    """The error for a cell that is incomplete, or that is not a row of the table of messages."""
 
 
 def missing_pages(path: Path) -> tuple[int, int]:
-    """Return how many whole pages a file has and how many are missing, 0 if its header is not reliable."""
+    """Return the number of whole pages in a file, and the number of missing pages.
+
+    If the header is incomplete, both are 0. If the header is out of date, the number of missing pages is 0.
+    """
     with path.open("rb") as file:
         header = file.read(100)
     if len(header) < 100:
@@ -35,7 +39,7 @@ def missing_pages(path: Path) -> tuple[int, int]:
 
 
 def rows_of_pages(path: Path, columns: tuple[int, int, int], topics: frozenset[int], after: int) -> Iterator[Row]:
-    """Yield the whole rows on all leaf pages of a file, in rowid order, if their rowid is above `after`.
+    """Yield the whole rows on all leaf pages of a file in rowid order. Only rows with a rowid above `after` are yielded.
 
     columns: the column indices of topic id, time and message. A leaf page does not name its table, so a row counts as a
     message if these columns have valid values and the topic id is in `topics`.
@@ -85,9 +89,10 @@ def _varint(data: mmap.mmap, at: int) -> tuple[int, int]:
 def _read_row(
     data: mmap.mmap, at: int, page: int, columns: tuple[int, int, int], topics: frozenset[int], whole: bool
 ) -> tuple[int, int, bytes]:
-    """Return topic id, time (ns) and message of the cell at byte `at` of the file. The message is empty without `whole`.
+    """Return the topic id, the time (ns) and the message of the cell at byte `at` of the file.
 
-    page: the page size, bytes. Raises _CellError if the cell is incomplete or is not a row of messages.
+    page: the page size, bytes. whole: whether to read the message. If False, the message is empty. Raises _CellError if the
+    cell is incomplete, or if it is not a row of the table of messages.
     """
     size, at = _varint(data, at)
     _, at = _varint(data, at)  # The rowid.

@@ -19,24 +19,25 @@ _MODELS = {
     "plumb bob": "plumb_bob",
     "rational polynomial": "rational_polynomial",
 }  # The distortion models by the alternative names that drivers use.
-_UNDISTORTED = ("", "none", "plumb_bob", "rational_polynomial", "equidistant")  # Models without distortion if D is zero.
+_UNDISTORTED = ("", "none", "plumb_bob", "rational_polynomial", "equidistant")
+"""The names of the models that have no distortion if D is zero."""
 _HINT = "--camera-info FILE can give the calibration"
 
 
 def camera_of(info: Any, name: str, topic: str, rectified: bool) -> tuple[Camera, Floats]:
     """Return the camera of a sensor_msgs/CameraInfo (ROS 1 or 2), and its pose frame_T_camera (4, 4) in the header frame.
 
-    If `rectified`, there is no distortion. The camera matrix is the left 3x3 part of P, or K if both P and D are zero. If
-    not, K and D apply. R is then the rotation of frame_T_camera, because the header frame belongs to the rectified camera
-    (as in image_geometry). The camera is for the image after binning and region of interest. name: the name of the camera.
-    topic: the topic of the message, for errors. Raises LogError if the camera is not calibrated or its distortion is
-    invalid.
+    rectified: whether the images are rectified. If True, the camera has no distortion, its matrix is the left 3x3 part of P
+    (K if both P and D are zero), and frame_T_camera is the identity. If False, K is the matrix, D is the distortion, and R
+    is the rotation of frame_T_camera. The header frame belongs to the rectified camera, as in image_geometry. The camera
+    describes images after binning and region of interest. name: the name of the camera. topic: the topic of the message,
+    for errors. Raises LogError if the camera is not calibrated or its distortion is invalid.
     """
     values = _values(info, "P")[[0, 1, 2, 4, 5, 6, 8, 9, 10]] if rectified else _values(info, "K")
-    if rectified and not values.any() and not _values(info, "D").any():  # P is unset. Without distortion, K is right.
+    if rectified and not values.any() and not _values(info, "D").any():  # P is unset. K is the same without distortion.
         values = _values(info, "K")
     across, down = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
-    region = info.roi  # K and P are for the full image before region of interest and binning.
+    region = info.roi  # K and P describe the full image, before region of interest and binning.
     width, height = int(region.width or info.width) // across, int(region.height or info.height) // down
     matrix = values.reshape(3, 3).copy()
     matrix[0, 2] -= region.x_offset

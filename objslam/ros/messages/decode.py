@@ -16,20 +16,20 @@ if TYPE_CHECKING:
 
 _MAX_DEFINITION = 1 << 18  # The length limit of a definition, characters. The limit bounds the parsing time.
 _MAX_TYPES, _MAX_FIELDS, _MAX_ELEMENTS = 200, 2000, 50_000
-"""How many types, fields and array elements a definition may have. The limits bound the size of the generated code."""
+"""The largest numbers of types, fields and array elements in a definition. They bound the size of the generated code."""
 _WRONG = (ValueError, LookupError, ArithmeticError, AssertionError, RecursionError, TypeError, AttributeError, struct.error)
 """The errors that the type library raises for malformed definitions and messages, besides its own errors."""
 
 
 class DecodeError(ValueError):
-    """A message or a message type cannot be decoded, for the reason in the message of the error."""
+    """The error for a message, or for a message type, that cannot be decoded. The text of the error gives the reason."""
 
 
 def read_head(data: bytes, encoding: str) -> tuple[int, str, int]:
-    """Return timestamp (ns) and frame_id from the std_msgs/Header at the start of a message, and the u32 number after it.
+    """Return timestamp (ns) and frame_id of the std_msgs/Header at the start of a message, and the next unsigned integer.
 
-    If an array follows the header, the number is its length. It is 0 if the message ends after the header. Raises
-    DecodeError if the header is cut off.
+    The integer has 32 bits. If an array follows the header, the integer is the length of the array. If the message ends
+    after the header, the integer is 0. encoding: "ros1" or "cdr". Raises DecodeError if the header is cut off.
     """
     order = ">" if encoding == "cdr" and data[1:2] == b"\0" else "<"
     try:
@@ -47,16 +47,19 @@ def read_head(data: bytes, encoding: str) -> tuple[int, str, int]:
 
 
 def read_length(data: bytes, encoding: str) -> int:
-    """Return the array length of a message that is only an array (tf2_msgs/TFMessage), 0 if the message is too short."""
+    """Return the array length in a message that is only an array, such as tf2_msgs/TFMessage.
+
+    The result is 0 if the message is too short. encoding: "ros1" or "cdr".
+    """
     at = 4 if encoding == "cdr" else 0
     big = encoding == "cdr" and data[1:2] == b"\0"
     return int.from_bytes(data[at : at + 4], "big" if big else "little") if len(data) >= at + 4 else 0
 
 
 def make_decoder(connection: Connection) -> Callable[[bytes], Any]:
-    """Return a function that decodes the messages of a connection and raises DecodeError for malformed messages.
+    """Return a function that decodes the messages of a connection. The function raises DecodeError for malformed messages.
 
-    Without a definition in the file, known definitions are tried. Raises DecodeError if no definition can be used.
+    If the file has no definition, the known definitions are tried. Raises DecodeError if no definition can be used.
     """
     name, encoding = connection.type, connection.encoding
     if encoding not in ("ros1", "cdr"):
@@ -83,9 +86,10 @@ def make_decoder(connection: Connection) -> Callable[[bytes], Any]:
 
 @lru_cache(maxsize=256)
 def typestores(name: str, encoding: str, definition: str, language: str) -> tuple[Typestore, ...]:
-    """Return a cached type store for each possible definition of a type. language: "msg" or "idl".
+    """Return a type store of the rosbags library for each possible definition of a type. The result is cached.
 
-    Raises DecodeError if there is no definition, or if one cannot be used.
+    definition: the definition in the bag, or "". language: the language of the definition, "msg" or "idl". Raises
+    DecodeError if there is no definition, or if a definition cannot be used.
     """
     from rosbags.interfaces import Nodetype
     from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore

@@ -1,6 +1,7 @@
-"""Message definitions that are neither in the type library nor in bags before ROS 2 Iron.
+"""Message definitions that neither the type library nor bags before ROS 2 Iron contain.
 
-They are from the documentation of the packages. Messages of vision_msgs 3.x and 4.x have equal bytes, 2.x (Foxy) differs.
+The definitions are from the documentation of the packages. Messages of vision_msgs 3.x and 4.x have the same bytes. Messages
+of vision_msgs 2.x (Foxy) have other bytes.
 """
 
 _TYPES = {
@@ -35,7 +36,8 @@ _TAG = (
 
 
 def _array(element: str, fields: str, types: dict[str, str] = _TYPES) -> str:
-    """Return the definition of an array message, followed by the definitions of the types it may use, as bags store them."""
+    """Return the definition of a message with an array of detections, and the definitions of all types it may use. The text
+    has the form that bags store. element: the type of a detection. fields: the definition of this type."""
     parts = "".join(f"{'=' * 80}\nMSG: {name}\n{part}" for name, part in {**types, element: fields}.items())
     return f"std_msgs/Header header\n{element}[] detections\n{parts}"
 
@@ -50,5 +52,5 @@ KNOWN: dict[str, tuple[str, ...]] = {
     "vision_msgs/msg/Detection3DArray": (VISION_MSGS_3D,),
     "apriltag_msgs/msg/AprilTagDetectionArray": (_array("apriltag_msgs/AprilTagDetection", _TAG),),
 }
-"""The possible definitions of each type. A message fits only one of them, because a definition must use all bytes of the
-message."""
+"""The possible definitions of each message type. A message fits only one definition, because the definition must use all
+bytes of the message."""

@@ -12,7 +12,8 @@ from objslam.core.geometry import pose_from_quaternion
 from objslam.core.types import MAX_BOXES as MAX_BOXES
 from objslam.ros.messages.topic_types import DETECTIONS
 
-WRONG_LAYOUT = (AttributeError, TypeError, LookupError, ValueError)  # The errors of `find_boxes` for a wrong layout.
+WRONG_LAYOUT = (AttributeError, TypeError, LookupError, ValueError)
+"""The errors that `find_boxes` raises for a message whose fields have another layout."""
 _UNKNOWN = [math.nan] * 4
 
 
@@ -33,8 +34,8 @@ def find_boxes(type_: str, message: Any) -> Iterator[Found]:
 
 
 def track_number(name: str, tracks: dict[str, int]) -> int:
-    """Return the track id of a track name. A name of digits is the id itself. Any other name gets a new id, which `tracks`
-    keeps. The empty name has the id -1."""
+    """Return the track id of a track name. If the name has only digits, the id is this number. Any other name gets a new id,
+    which is stored in `tracks`. The empty name has the id -1."""
     if not name:
         return -1
     if name.isascii() and name.isdigit() and len(name) < 18:
@@ -43,8 +44,11 @@ def track_number(name: str, tracks: dict[str, int]) -> int:
 
 
 def boxes_of_points(camera: Camera, points: Floats) -> Floats:
-    """Return the boxes (M, 4) of tags, px of the raw image, from centre and corners (M, 5, 3), m, in the camera frame.
-    The tag centre is the centre of the box. If a point is outside the field of the lens, the box is NaN."""
+    """Return the boxes (M, 4) of tags, x1, y1, x2, y2 in px of the raw image. The centre of a tag is the centre of its box.
+
+    points: (M, 5, 3) the centre and the corners of each tag in the camera frame, m. If a point is outside the field of the
+    lens, the box is NaN.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = project(camera, points.reshape(-1, 3)).reshape(-1, 5, 2)
     reach = np.abs(pixels[:, 1:] - pixels[:, :1]).max(axis=1)
@@ -54,7 +58,7 @@ def boxes_of_points(camera: Camera, points: Floats) -> Floats:
 
 
 def vision_boxes(message: Any) -> Iterator[Found]:
-    """Yield the detections of a vision_msgs/Detection2DArray. Each has the label and score of its best hypothesis.
+    """Yield the detections of a vision_msgs/Detection2DArray. Each detection has the label and score of its best hypothesis.
     A rotated box is replaced by the upright box around it."""
     for detection in message.detections:
         centre, label, score = detection.bbox.center, "", 0.0
@@ -80,8 +84,8 @@ def tag_boxes(message: Any) -> Iterator[Found]:
     """Yield the tags of an AprilTag array message with label tag_<id> and score 1.
 
     The box centre is the intersection of the tag diagonals. The box is symmetric about this centre and contains all corners.
-    A message of apriltag_ros has poses instead of corners, so its tags get `points` instead of a box. Its tag bundles are
-    skipped, because a bundle is not a single object.
+    A message of apriltag_ros has poses instead of corners, so its tags get `points` instead of a box. Tag bundles in such a
+    message are skipped, because a bundle is not a single object.
     """
     for tag in message.apriltags if hasattr(message, "apriltags") else message.detections:
         if hasattr(tag, "corners"):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from objslam.io.images import decode_colour, decode_depth
 from objslam.ros.messages.decode import DecodeError
 
-DEPTH_SCALE = 1000.0  # The units per metre in decoded and written depth images.
+DEPTH_SCALE = 1000.0  # The number of depth units per metre in decoded and written depth images.
 _MAX_SIDE = 1 << 15  # The limit of width and height, px. A message with a larger image counts as damaged.
 _PLAIN = {"mono8": (np.uint8, 1), "8uc1": (np.uint8, 1), "mono16": (np.uint16, 1), "16uc1": (np.uint16, 1),
           "32fc1": (np.float32, 1), "bgr8": (np.uint8, 3), "8uc3": (np.uint8, 3), "rgb8": (np.uint8, 3),
@@ -43,8 +43,8 @@ def colour_image(message: Any) -> NDArray[Any]:
 
 
 def depth_image(message: Any) -> NDArray[Any]:
-    """Return the depth (H, W) in an image message, uint16, in 1 / `DEPTH_SCALE` m, 0 if unknown. Raises DecodeError if the
-    message is malformed or not a depth image."""
+    """Return the depth (H, W) in an image message as uint16, in units of 1 / `DEPTH_SCALE` m. An unknown depth is 0. Raises
+    DecodeError if the message is malformed or not a depth image."""
     if (packing := _packing(message)) is None:
         return _depth_units(_pixels(message)[0])
     if "compresseddepth" in packing:
@@ -55,8 +55,8 @@ def depth_image(message: Any) -> NDArray[Any]:
 def image_file(message: Any, depth: bool) -> tuple[bytes, str]:
     """Return the content and the suffix of a file for an image message. Raises DecodeError if the message is malformed.
 
-    depth: whether it is a depth image, which becomes a PNG of the result of `depth_image`. Colour images in JPEG or PNG are
-    not changed. Other colour images become PNG.
+    depth: whether the message is a depth image. A depth image becomes a PNG of the result of `depth_image`. A colour image
+    in JPEG or PNG is not changed. Any other colour image becomes a PNG.
     """
     packing = _packing(message)
     if depth or "compresseddepth" in (packing or ""):
@@ -76,7 +76,7 @@ def _unpack(decode: Callable[[bytes], NDArray[Any] | None], message: Any) -> NDA
 
 
 def _packing(message: Any) -> str | None:
-    """Return the format of a CompressedImage in lower case without blanks, None for an Image."""
+    """Return the format of a CompressedImage in lower case without blanks. Return None for an Image."""
     return str(message.format).lower().replace(" ", "") if hasattr(message, "format") else None
 
 
@@ -88,7 +88,8 @@ def _colours(message: Any) -> NDArray[Any]:
 
 
 def _pixels(message: Any) -> tuple[NDArray[Any], str | None]:
-    """Return the pixels (H, W) or (H, W, C) of a sensor_msgs/Image, and the name of the OpenCV conversion to BGR."""
+    """Return the pixels (H, W) or (H, W, C) of a sensor_msgs/Image, and the name of the OpenCV conversion to BGR. The name
+    is None if no conversion is needed."""
     encoding, height, width = message.encoding.lower(), int(message.height), int(message.width)
     bayer = encoding.startswith("bayer_") and encoding.endswith("8")
     if encoding not in _PLAIN and not bayer:
@@ -115,9 +116,10 @@ def _convert(image: NDArray[Any], conversion: str) -> NDArray[Any]:
 
 
 def _compressed_depth(data: bytes, packing: str) -> NDArray[Any]:
-    """Decode data of compressed_depth_image_transport: a header and a PNG.
+    """Return the depth (H, W) in data of compressed_depth_image_transport, as `depth_image` does. The data are a header and
+    a PNG.
 
-    For float images, the PNG has a / depth + b, with depth in m. The numbers a and b are in the header.
+    If the original image has floats, a pixel of the PNG is a / depth + b, with the depth in m. The header has a and b.
     """
     if b"\x89PNG" != data[_DEPTH_HEADER : _DEPTH_HEADER + 4]:
         raise DecodeError("its compressed depth is not PNG")
@@ -132,7 +134,10 @@ def _compressed_depth(data: bytes, packing: str) -> NDArray[Any]:
 
 
 def _depth_units(image: NDArray[Any]) -> NDArray[Any]:
-    """Return depth (H, W), uint16, in 1 / `DEPTH_SCALE` m, 0 if unknown. REP 118: uint16 is in mm, float in m."""
+    """Return the depth (H, W) as uint16, in units of 1 / `DEPTH_SCALE` m. An unknown depth is 0.
+
+    image: (H, W) depth as in REP 118, which is uint16 in mm or float32 in m.
+    """
     if image.dtype == np.uint16 and image.ndim == 2:
         return image
     if image.dtype != np.float32 or image.ndim != 2:

@@ -9,9 +9,9 @@ from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGE, ODO
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-_CAPITALS = {"d": "D", "k": "K", "r": "R", "p": "P"}  # How ROS 1 writes these fields of a camera.
+_CAPITALS = {"d": "D", "k": "K", "r": "R", "p": "P"}  # The ROS 1 names of fields of CameraInfo, by their ROS 2 names.
 _INTEGERS = {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32)}
-_TIMES = {"int32", "uint32"}  # Wider seconds do not fit a count of ns in 64 bits.
+_TIMES = {"int32", "uint32"}  # The types of seconds and nanoseconds. A time with wider seconds does not fit 64 bits of ns.
 _NUMBERS = {*_INTEGERS, "int64", "uint64", "float32", "float64"}
 _KINDS = {
     "text": {"string"},
@@ -42,13 +42,15 @@ _FIELDS: dict[str, dict[str, str]] = {
     | {"d[]": "number", "k[9]": "number", "r[9]": "number", "p[12]": "number"},
     **{name: {f"transforms[].{path}": kind for path, kind in _TRANSFORM.items()} for name in TRANSFORMS},
 }  # fmt: skip
-"""The fields by type, as the path to each and its kind. [] marks a list of any length, and [9] an array of 9."""
+"""The fields of each message type: the kind of each field by its path. [] marks a list of any length. [9] marks an array of
+9 elements."""
 
 
 def missing_field(store: Typestore, type_: str) -> str | None:
-    """Return the first field of a type that objslam reads but the definition in a store lacks. None if no field is missing.
+    """Return the first field of a type that objslam reads but the definition in a store lacks, or None if none is missing.
 
-    A field counts as missing if it has another type. Types that objslam does not read, and boxes, give None.
+    A field of a wrong kind counts as missing. For types of boxes, and for types that objslam does not read, nothing is
+    checked, and the result is None.
     """
     return next((path for path, kind in _FIELDS.get(type_, {}).items() if not _has(store, type_, path, kind)), None)
 

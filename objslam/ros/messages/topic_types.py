@@ -5,7 +5,8 @@ POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceS
 CAMERA_INFO, DETECTIONS = "sensor_msgs/msg/CameraInfo", "vision_msgs/msg/Detection2DArray"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 IMAGES = (IMAGE, COMPRESSED)
-LATCHED = (*TRANSFORMS, CAMERA_INFO)  # Types whose publishers may send only one message, possibly before a subscription.
+LATCHED = (*TRANSFORMS, CAMERA_INFO)
+"""The types whose publishers may send only one message, which may come before objslam subscribes."""
 
 
 def is_tags(type_: str) -> bool:

@@ -1,1 +1,1 @@
-"""Look up transforms between coordinate frames in a recording or live session. `ros.messages` decodes their messages."""
+"""Look up transforms between coordinate frames in a recording or live session. `ros.messages` decodes the messages of tf."""

@@ -13,11 +13,13 @@ from objslam.core.geometry import interpolate, inverse
 from objslam.ros.messages.poses import one_pose
 from objslam.ros.tf.frames import MAX_GAP, MAX_TRANSFORMS, climb, is_base, link, part, unchanged
 
-_MAX_KEPT = 10_000  # The limit of buffered transforms per child frame, enough for 10 s at 1 kHz. A larger one costs memory.
+_MAX_KEPT = 10_000
+"""The largest number of buffered transforms of a child frame. It is enough for 10 s at 1 kHz. A larger number takes more
+memory."""
 
 
 class UnknownTransform(LookupError):
-    """A transform is unknown at the requested time. `later`: whether a later message may supply it."""
+    """The error for a transform that is unknown at the requested time. later: whether a later message may supply it."""
 
     def __init__(self, message: str, later: bool) -> None:
         super().__init__(message)
@@ -28,7 +30,7 @@ class UnknownTransform(LookupError):
 class _Edge:
     """The poses parent_T_child of a child frame at increasing timestamps, s.
 
-    static: whether they come from /tf_static. still: whether the pose has never changed.
+    static: whether the poses come from /tf_static. still: whether the pose has never changed.
     """
 
     parent: str
@@ -38,10 +40,10 @@ class _Edge:
     still: bool = True
 
     def add(self, stamp: float, pose: Floats) -> bool:
-        """Add a pose at a timestamp, s. Return False, and do not add it, if it is older than the newest pose.
+        """Add a pose at a timestamp, s, and return True. If the pose is older than the newest pose, only return False.
 
-        If it is older by more than `MAX_GAP` s, the clock was set back. Then the buffer is cleared and the pose is added. A
-        pose with the newest timestamp replaces the newest pose.
+        If the pose is older by more than `MAX_GAP` s, the clock was set back. In this case, the older poses are removed, and
+        the pose is added. A pose with the newest timestamp replaces the newest pose.
         """
         if self.stamps and stamp < self.stamps[-1] - MAX_GAP:
             self.stamps.clear()
@@ -61,7 +63,7 @@ class _Edge:
     def at(self, stamp: float) -> Floats:
         """Return the interpolated pose at a timestamp, s. A pose that has never changed is known at all times.
 
-        Raises UnknownTransform outside of the buffer, or in a gap longer than `MAX_GAP`.
+        Raises UnknownTransform if the timestamp is outside of the buffered times, or in a gap longer than `MAX_GAP` s.
         """
         if self.still:
             return self.poses[-1]
@@ -82,8 +84,8 @@ class _Edge:
 class TfBuffer:
     """The latest transforms of all frames. A pose a_T_b transforms b coordinates to a coordinates.
 
-    A frame gets a new parent only `MAX_GAP` s after the last transform to its old parent. A static transform never replaces
-    a moving one.
+    A moving frame gets a new parent only `MAX_GAP` s after the last transform to its old parent. A static transform never
+    replaces a moving transform.
     """
 
     def __init__(self) -> None:
@@ -92,9 +94,9 @@ class TfBuffer:
         self._bases: set[str] = set()
 
     def add(self, transform: Any, received: float, static: bool) -> str:
-        """Add a geometry_msgs/TransformStamped and return its child frame. Raises ValueError if it is refused.
+        """Add a geometry_msgs/TransformStamped and return its child frame. Raises ValueError if the transform is refused.
 
-        received: the arrival time, s. static: whether it came on /tf_static.
+        received: the arrival time, s. static: whether the transform came on /tf_static.
         """
         parent, child = link(transform)
         pose = one_pose(transform.transform.translation, transform.transform.rotation)
@@ -127,7 +129,7 @@ class TfBuffer:
         return self._bases | {moved} if moved in self._names else set(self._bases)
 
     def _count(self, child: str, parent: str, old: str | None) -> None:
-        """Count the frames of a new transform, which replaces one with the parent `old`, None if there was none."""
+        """Count the frames of a new transform. old: the parent in the transform that it replaces, or None."""
         self._names.update((parent,) if old is not None else (parent, child))
         if old is not None:
             self._names[old] -= 1
@@ -137,14 +139,14 @@ class TfBuffer:
         self._bases.update(frame for frame in (parent, child) if is_base(frame))
 
     def above(self, frame: str) -> Sequence[str]:
-        """Return the frames from a frame up to the root. Raises UnknownTransform if they form a cycle."""
+        """Return the frames from `frame` up to the root, both included. Raises UnknownTransform if they form a cycle."""
         way, circle = climb(frame, lambda child: self._edges[child].parent if child in self._edges else None)
         if circle is not None:
             raise UnknownTransform(f"tf runs in a circle at {circle}", later=True)
         return way
 
     def _between(self, a: str, b: str) -> tuple[Sequence[str], Sequence[str]]:
-        """Return the frames from a and from b up to their first common ancestor, without the ancestor."""
+        """Return the frames from a up to the first common ancestor of a and b, and those from b. Both lack the ancestor."""
         ways = part(self.above(a), self.above(b))
         if ways is None:
             raise UnknownTransform(f"tf does not connect {a} and {b}", later=True)
@@ -157,7 +159,7 @@ class TfBuffer:
         return np.asarray(inverse(top_T_a) @ top_T_b) if up else top_T_b
 
     def newest(self, a: str, b: str) -> float | None:
-        """Return the newest timestamp, s, at which all transforms from a to b are known, None if all of them are static."""
+        """Return the newest timestamp, s, at which all transforms from a to b are known. Return None if all are static."""
         moving = [edge.stamps[-1] for way in self._between(a, b) for child in way if not (edge := self._edges[child]).static]
         return min(moving, default=None)
 

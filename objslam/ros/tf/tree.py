@@ -15,14 +15,14 @@ from objslam.errors import LogError
 from objslam.ros.messages.poses import PoseRows
 from objslam.ros.tf.frames import MAX_GAP, MAX_TRANSFORMS, climb, link, part, unchanged
 
-_NAMED = 6  # The limit of frames listed in a message. The limit keeps the message readable.
+_NAMED = 6  # The largest number of frames that an error lists. The limit keeps the error readable.
 
 
 @dataclass
 class TfRows:
-    """Transforms by (parent, child). moving: all in the order of arrival. static: only the last.
+    """The transforms of a recording by (parent, child). moving: all transforms on /tf in the order of arrival.
 
-    refused: the number of refused transforms by reason.
+    static: only the last transform on /tf_static. refused: the number of refused transforms by reason.
     """
 
     moving: dict[tuple[str, str], PoseRows] = field(default_factory=dict)
@@ -30,8 +30,8 @@ class TfRows:
     refused: Counter[str] = field(default_factory=Counter)
 
     def add(self, transform: Any, logged: int, static: bool) -> None:
-        """Add a geometry_msgs/TransformStamped. An invalid transform is counted in `refused`. logged: the time of recording,
-        ns."""
+        """Add a geometry_msgs/TransformStamped. An invalid transform is only counted in `refused`. logged: its recording
+        time, ns. static: whether it was on /tf_static."""
         try:
             parent, child = link(transform)
         except ValueError as error:
@@ -65,8 +65,8 @@ class _Edge:
 class TfTree:
     """The tree of coordinate frames. A pose a_T_b transforms b coordinates to a coordinates.
 
-    A frame with several parents keeps the parent with the most transforms. Of transforms with equal timestamps, the last is
-    used. Methods raise LogError if two frames are not connected or the tree has a cycle.
+    A frame with several parents keeps the parent with the most transforms. If transforms have equal timestamps, the last of
+    them is used. Methods raise LogError if two frames are not connected, or if the frames form a cycle.
     """
 
     def __init__(self, rows: TfRows, ledger: Ledger) -> None:
@@ -93,12 +93,13 @@ class TfTree:
         return (*up, top, *reversed(down))
 
     def still(self, a: str, b: str) -> Floats | None:
-        """Return a_T_b (4, 4), None if it changes over time."""
+        """Return a_T_b (4, 4), or None if this pose changes over time."""
         still = all(self._edge(child).still for way in self._ways(a, b) for child in way)
         return self.at(a, b, np.zeros(1))[0][0] if still else None
 
     def stamps(self, a: str, b: str) -> Floats:
-        """Return the timestamps (N,), s, of all moving transforms between a and b, within the time range that all cover."""
+        """Return the timestamps (N,), s, of all moving transforms between a and b. Timestamps outside the time range that
+        all these transforms cover are left out."""
         moving = [edge for way in self._ways(a, b) for child in way if not (edge := self._edge(child)).still]
         if not moving:
             return np.zeros(0)
@@ -107,7 +108,7 @@ class TfTree:
         return stamps[(stamps >= first) & (stamps <= last)]
 
     def above(self, frame: str) -> Sequence[str]:
-        """Return the frames from a frame up to the root."""
+        """Return the frames from `frame` up to the root, both included."""
         way, circle = climb(frame, self._parent.get)
         if circle is not None:
             names = " -> ".join([*way[way.index(circle) :], circle][:_NAMED])
@@ -115,7 +116,7 @@ class TfTree:
         return way
 
     def at(self, a: str, b: str, stamps: Floats) -> tuple[Floats, Bools]:
-        """Return the interpolated a_T_b (Q, 4, 4) at timestamps (Q,), s, and the mask (Q,) of known poses."""
+        """Return the interpolated a_T_b (Q, 4, 4) at timestamps (Q,), s, and a mask (Q,), True where the pose is known."""
         up, down = self._ways(a, b)
         top_T_a, known_a = self._down(up, stamps)
         top_T_b, known_b = self._down(down, stamps)
@@ -134,7 +135,7 @@ class TfTree:
         return pose, known
 
     def _ways(self, a: str, b: str) -> tuple[Sequence[str], Sequence[str]]:
-        """Return the frames from a and from b up to their first common ancestor, without the ancestor."""
+        """Return the frames from a up to the first common ancestor of a and b, and those from b. Both lack the ancestor."""
         ways = part(self.above(a), self.above(b))
         if ways is None:
             raise LogError(

@@ -8,7 +8,7 @@ from objslam.sources.options import Label, Option, WithRange
 
 _TOPIC = """ROS bags, dds, rclpy: the topic for a role (odometry, localization, detections, image, depth, camera_info). \
 With several cameras: CAMERA.ROLE=/NAME. ROLE=none uses no topic. ROLE=tf takes the path from tf. May be repeated."""
-_RECTIFIED = "ROS bags, dds, rclpy: whether images and boxes are rectified or raw. [default: by topic name]"
+_RECTIFIED = "ROS bags, dds, rclpy: whether images and boxes are rectified or raw. Default: by topic name."
 _CALIBRATION = """ROS bags, dds, rclpy: a calibration file like camera.yaml. Several cameras are below `cameras:`. A file \
 with base_T_camera alone gives the mount of the camera."""
 _BASE = "ROS bags, dds, rclpy: the name of the robot's base frame."
