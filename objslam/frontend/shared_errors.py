@@ -189,7 +189,8 @@ class SharedErrors:
         moved = replace(
             keyframes, stamps=stamps, map_T_base=map_T_base, odom_T_base=odom_T_base, base_T_camera=base_T_camera
         )
-        moved = replace(moved, drift=gathered, step=step, wander=wander)
+        # The given stamps decide which keyframes count as localised, so that the graph is the same for all values.
+        moved = replace(moved, drift=gathered, step=step, wander=wander, given_stamps=keyframes.frame_stamps)
         reach, spread, bias = corrected_lengths(error, rays, self._half, 1 + self.noise.shrinkage)
         ranged = replace(rays, direction=direction, sigma=sigma, range=reach, range_sigma=spread, range_bias=bias)
         tags = settings.tags.scaled(1 + error.get("tag_scale", 0.0))

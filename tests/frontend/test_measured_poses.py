@@ -71,6 +71,21 @@ def test_a_localisation_that_follows_the_odometry_counts_once_for_each_correctio
     assert localized_motions(frames, SETTINGS) is None
 
 
+@pytest.mark.parametrize("clock", [-0.15, 0.02, 0.15])
+def test_a_clock_does_not_change_which_keyframes_count_as_localised(clock):
+    """Otherwise, the motions of a graph would have other poses at each value of the clock."""
+    log, _, _ = drive(0.4, follows=True)
+    frames = frames_of(log)
+    errors = shared_errors(log, frames, build_rays(log, frames, SETTINGS, Ledger()), SETTINGS)
+    values = errors.mean.copy()
+    values[errors.names.index(f"{log.cameras[0].camera.name}.clock")] = clock
+    moved, _, _ = errors.at(values)
+    assert np.abs(moved.stamps - frames.stamps - clock)[5:-5].max() < 1e-9
+    assert_array_equal(localized(moved), localized(frames))
+    again, _, _ = errors.take(moved, errors.rays).at(values)
+    assert_array_equal(again.frame_stamps, frames.stamps)
+
+
 def test_amcl_by_tf_gives_the_same_keyframes_as_its_poses_alone():
     frames, others = (frames_of(drive(0.4, follows)[0]) for follows in (True, False))
     both = np.searchsorted(frames.stamps, others.stamps)  # The poses alone end before the log.
