@@ -1,10 +1,12 @@
 """The most likely path: visits that were matched one post aside come back, and copies of posts lose their rays."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from objslam.association.path_search import state_grid, viterbi
-from objslam.association.path_search.most_likely_path import most_likely_path
+from objslam.association.path_search.most_likely_path import PathSearch
 from objslam.core.geometry import inverse, lift_se2
 from objslam.core.types import Keyframes, Rays
 
@@ -69,6 +71,12 @@ def drive(rng, posts, ranges=True, labels=1):
     return true, keyframes, rays, whose
 
 
+def most_likely_path(*given):
+    """The most likely path through a map, None if there is nothing to search."""
+    search = PathSearch.of(*given)
+    return None if search is None else search.path()
+
+
 def one_post_aside(true):
     """The path, of which the second round is turned by the angle between two posts."""
     wrong = true.copy()
@@ -130,6 +138,33 @@ def test_without_two_landmarks_of_a_label_there_is_nothing_to_search():
     assert most_likely_path(keyframes, rays, true, posts, np.arange(12), np.ones(12)) is None
     lost = np.where(np.arange(12)[:, None] > 0, np.nan, posts)
     assert most_likely_path(keyframes, rays, true, lost, np.zeros(12, dtype=np.int64), np.ones(12)) is None
+
+
+@pytest.mark.parametrize("ranges", [True, False])
+def test_a_landmark_that_is_not_there_attracts_no_ray_of_its_stretches(ranges):
+    """Against a search in which this landmark has another label in these stretches, so that no ray can belong to it."""
+    rng = np.random.default_rng(0)
+    posts = rows_of_posts()
+    true, keyframes, rays, whose = drive(rng, posts, ranges)
+    posts = np.concatenate([posts, rng.uniform([-6, -6, 0], [6, 6, 2], (6, 3)), [[1.0, 1.0, 1.0]]])
+    wrong, rate = one_post_aside(true), np.append(rng.uniform(0.3, 1.0, 18), 0.0)
+    search = PathSearch.of(keyframes, rays, wrong, posts, np.zeros(19, dtype=np.int64), rate)
+    whole, nothing = search.path().map_T_base, np.zeros(len(rays), dtype=bool)
+    for j in (0, 18):  # The last one is not in the search.
+        np.testing.assert_allclose(search.path_without(j, nothing).map_T_base, whole, atol=1e-9)
+    moved = 0
+    for j in range(0, 12, 3):
+        mine = whose == j
+        elsewhere = replace(search.landmarks, label=np.where(np.arange(18) == j, 1, 0))
+        costs, others = (list(search.sight.costs(map_of)) for map_of in (search.landmarks, elsewhere))
+        stretches = np.unique(search.sight.stretch[mine])
+        for k in stretches.tolist():
+            costs[k] = others[k]
+        best = viterbi.most_likely_states(search._motions, iter(costs), search.sight.grid)
+        found = search.path_without(j, mine).map_T_base[search.middle] @ inverse(wrong[search.middle])
+        assert (np.abs(np.arctan2(found[:, 1, 0], found[:, 0, 0]) - best[:, 2]) < 1e-9).mean() > 0.98  # Costs are rounded.
+        moved += np.abs(search.path_without(j, mine).map_T_base - whole).max() > 1e-3
+    assert moved >= 2
 
 
 def test_rays_taken_in_parts_give_the_same_path(monkeypatch):

@@ -151,7 +151,8 @@ def along_paths(monkeypatch):
         monkeypatch.setattr(JointState, "_explained_like", lambda state, other: state.explained)
         monkeypatch.setattr(JointState, "associated", lambda state, *_, rough: names[state.association.count])
         monkeypatch.setattr(JointState, "alternated", lambda state, *_: state)
-        monkeypatch.setattr(relocalization, "relocalize", lambda *_: (np.eye(4)[None], None))
+        search = SimpleNamespace(found=lambda: (np.eye(4)[None], None))
+        monkeypatch.setattr(relocalization.Relocalization, "of", lambda _: search)
         monkeypatch.setattr(relocalization, "rays_moved", lambda *_: 30)
         keyframes = SimpleNamespace(base_T_camera=np.eye(4)[None], odom_T_base=np.eye(4)[None], localized_every=0.0)
         return solve(replace(begin, keyframes=keyframes, rays=range(30)), "association", names[0], None), held

@@ -1,6 +1,6 @@
 """Equal things in groups at a localisation whose headings err for seconds, so that rays of several things meet."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -151,29 +151,24 @@ def test_a_path_that_may_be_bent_to_false_objects_is_named(turning, labels, told
     assert check_neighbours(solution, None, settings) is None
 
 
-@dataclass(frozen=True)
-class Positions:
-    """An estimate that has only positions."""
-
-    positions: np.ndarray
-
-
 @pytest.mark.parametrize(("lost", "solved"), [(0, True), (2, True), (3, False), (4, False)])
 def test_a_map_without_an_object_is_solved_only_if_its_rays_have_others(monkeypatch, lost, solved):
     """Rays without an object explain the log worse, so the object is no phantom."""
     owner = np.array([0, 0, 0, 0, 1, 1, 0])
     state = SimpleNamespace(
         association=Association(owner, np.zeros(2, dtype=np.int64)),
-        estimate=Positions(np.zeros((2, 3))),
         agree=np.array([True] * 6 + [False]),
     )
-    without = np.where((owner == 0) & (np.arange(7) < lost), -1, 1)
+    left = np.where((owner == 0) & (np.arange(7) < lost), -1, 1)
 
-    def relocalized(of, estimate):
-        assert np.isnan(estimate.positions[0]).all()
-        return np.zeros((0, 4, 4)), Association(without, state.association.label)
+    class Search:
+        def __init__(self):
+            self.state = state
 
-    monkeypatch.setattr(phantoms, "_relocalized", relocalized)
+        def found(self, without):
+            assert without == 0
+            return np.zeros((0, 4, 4)), Association(left, state.association.label)
+
     monkeypatch.setattr(phantoms, "_solved_along", lambda of, path, association: association)
-    found = phantoms._without(state, 0)
+    found = phantoms._without(Search(), 0)
     assert (found is not None) == solved

@@ -1,12 +1,13 @@
 """Compute the cost of the rays of each stretch of a path, in each state of the stretch."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
 from objslam.association.path_search.state_grid import STRETCH, Cells, Grid
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import lift_se2
 from objslam.core.statistics import STRAY_RAY
 from objslam.core.types import Rays
@@ -27,6 +28,20 @@ class MapLandmarks:
     position: Floats
     label: Ints
     rarity: Floats
+
+    def take(self, some: Bools) -> Self:
+        """Return the landmarks of a mask (N,)."""
+        return replace(self, position=self.position[some], label=self.label[some], rarity=self.rarity[some])
+
+
+@dataclass(frozen=True)
+class _Variances:
+    """The variances of R rays, with the rounding to the grid. angle: (R,) rad^2, of the directions. range: (R,) m^2, of the
+    ranges. place: m^2, of a landmark."""
+
+    angle: Floats
+    range: Floats
+    place: float
 
 
 @dataclass(frozen=True)
@@ -59,26 +74,44 @@ class Sight:
             yield from total.reshape(end - begin, -1, across, across)
             begin = end
 
+    def of_stretches(self, which: Bools) -> Self:
+        """Return the rays of some stretches (G,) alone."""
+        mine = which[self.stretch]
+        stretch, pivot = (np.cumsum(which) - 1)[self.stretch[mine]], self.pivot[which]
+        origin, direction = self.origin[mine], self.direction[mine]
+        return replace(self, rays=self.rays.take(mine), origin=origin, direction=direction, stretch=stretch, pivot=pivot)
+
+    @property
+    def _reach(self) -> float:
+        """The largest shift, m."""
+        return float(np.sqrt(2) * self.grid.shifts[-1])
+
+    def _variances(self, rays: Rays) -> "_Variances":
+        """Return the variances of some rays."""
+        place = _LANDMARK_SIGMA**2 + self.grid.shift**2 / 12
+        return _Variances(
+            angle=rays.sigma**2 + (STRETCH * self.grid.turn / 2) ** 2 + self.grid.turn**2 / 12,
+            range=rays.range_sigma**2 + np.nan_to_num(rays.range_bias) ** 2 + place,
+            place=place,
+        )
+
     def _ray_costs(self, some: Ints, turn: float, landmarks: MapLandmarks) -> Cells:
         """Return the cost (n, X * X) of rays (n,) for each shift after a turn. A ray costs at most `STRAY_RAY`."""
         rays, pivot = self.rays.take(some), self.pivot[self.stretch[some]]
         turned = lift_se2(np.array([0.0, 0.0, turn]))[:3, :3].T
         n, origin = self.direction[some] @ turned, pivot + (self.origin[some] - pivot) @ turned
-        ranged = np.isfinite(rays.range)
-        reach, rounded = np.sqrt(2) * self.grid.shifts[-1], _LANDMARK_SIGMA**2 + self.grid.shift**2 / 12
-        angle = rays.sigma**2 + (STRETCH * self.grid.turn / 2) ** 2 + self.grid.turn**2 / 12
-        noise = rays.range_sigma**2 + np.nan_to_num(rays.range_bias) ** 2 + rounded
+        ranged, sigma2, reach = np.isfinite(rays.range), self._variances(rays), self._reach
         to = landmarks.position - origin[:, None]
         along = np.einsum("rnk,rk->rn", to, n)
         distance2 = np.einsum("rnk,rnk->rn", to, to)
-        spread = angle[:, None] * distance2 + rounded
+        spread = sigma2.angle[:, None] * distance2 + sigma2.place
         near = (along > 0) & (rays.label[:, None] == landmarks.label)
         near &= distance2 - along**2 < (reach + _NEAR * np.sqrt(spread)) ** 2
         beyond = along - np.where(ranged, rays.range, 0.0)[:, None]
-        near &= ~ranged[:, None] | (np.abs(beyond) < reach + _NEAR * np.sqrt(noise)[:, None])
+        near &= ~ranged[:, None] | (np.abs(beyond) < reach + _NEAR * np.sqrt(sigma2.range)[:, None])
         i, j = np.nonzero(near)
         # The cost is quadratic in the shift. A range measures along the ray, the bearing measures across it.
-        by_range, by_bearing = np.where(ranged, 1 / noise, 0.0)[i], 1 / spread[i, j]
+        by_range, by_bearing = np.where(ranged, 1 / sigma2.range, 0.0)[i], 1 / spread[i, j]
         n, over = n[i], beyond[i, j]
         off = to[i, j] - along[i, j, None] * n
         (x, y), more = n[:, :2].T, by_range - by_bearing

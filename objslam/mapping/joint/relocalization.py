@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from objslam.association.nearest_neighbour import assign
 from objslam.association.observations import PosedRays, observe
-from objslam.association.path_search.most_likely_path import most_likely_path
+from objslam.association.path_search.most_likely_path import PathSearch
 from objslam.association.visibility import detection_history, frames_of
-from objslam.config import Settings
 from objslam.core.arrays import Floats
-from objslam.core.camera import Camera
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.mapping.solution import rays_moved
 
@@ -46,10 +44,10 @@ def relocalized(begin: JointState) -> JointState:
         assert state.association is not None
         assert state.estimate is not None
         before = state.association
-        found = relocalize(state.keyframes, state.rays, state.cameras, state.settings, before, state.estimate)
-        if found is None:
+        search = Relocalization.of(state)
+        if search is None:
             break
-        path, objects = found
+        path, objects = search.found()
         association = state.associated(path, (objects, state.estimate.positions), rough=True)
         if rays_moved(before.object, association.object) <= _STILL * len(state.rays):
             break
@@ -72,37 +70,56 @@ def relocalized(begin: JointState) -> JointState:
     return begin.better(turns)
 
 
-def relocalize(
-    keyframes: Keyframes,
-    rays: Rays,
-    cameras: tuple[Camera, ...],
-    settings: Settings,
-    association: Association,
-    estimate: Estimate,
-) -> tuple[Floats, Association] | None:
-    """Return the most likely path (K, 4, 4) map_T_base through a map, and the objects of the rays along it.
+@dataclass(frozen=True)
+class Relocalization:
+    """A search for the most likely path through the map of a solved state, and for the objects of the rays along it.
 
-    The objects stay the same, but may lose all their rays. Return None if no label has two objects that could be confused.
+    Build it with `of`.
     """
-    position = estimate.positions
-    if not len(position):
-        return None
-    held = np.where((estimate.weight > 0) & np.isfinite(position[:, 0])[association.object], association.object, -1)
-    map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
-    obs, ray, keyframe = observe(PosedRays(rays, keyframes, cameras, map_T_camera, rays.sigma))
-    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings, cut=rays.cut)
-    history = detection_history(obs, held[ray], np.nan_to_num(position), association.label, view)
-    rate = history.seen / np.maximum(history.expected, 1)
-    found = most_likely_path(keyframes, rays, estimate.map_T_base, position, association.label, rate)
-    if found is None:
-        return None
-    objects = assign(
-        rays,
-        position,
-        np.nan_to_num(estimate.covariance),
-        association.label[:, None] == np.arange(len(rays.label_names)),
-        found.map_T_base @ keyframes.base_T_camera,
-        rays.sigma,
-        pose_covariance=np.broadcast_to(found.pose_covariance, (len(keyframes), 6, 6)),
-    )
-    return found.map_T_base, Association(objects, association.label)
+
+    state: JointState
+    search: PathSearch
+
+    @classmethod
+    def of(cls, state: JointState) -> Self | None:
+        """Prepare the search. Return None if no label has two objects that could be confused."""
+        keyframes, rays, association, estimate = _solved(state)
+        position = estimate.positions
+        if not len(position):
+            return None
+        held = np.where(state.agree & np.isfinite(position[:, 0])[association.object], association.object, -1)
+        obs, ray, keyframe = observe(PosedRays(rays, keyframes, state.cameras, state.solved_poses, rays.sigma))
+        view = frames_of(keyframes, keyframe, state.cameras, state.solved_poses, state.settings, cut=rays.cut)
+        history = detection_history(obs, held[ray], np.nan_to_num(position), association.label, view)
+        rate = history.seen / np.maximum(history.expected, 1)
+        search = PathSearch.of(keyframes, rays, estimate.map_T_base, position, association.label, rate)
+        return None if search is None else cls(state, search)
+
+    def found(self, without: int | None = None) -> tuple[Floats, Association]:
+        """Return the path (K, 4, 4) map_T_base, and the objects of the rays along it.
+
+        The objects stay the same, but may lose all their rays. without: an object that is taken out of the map.
+        """
+        keyframes, rays, association, estimate = _solved(self.state)
+        if without is None:
+            path = self.search.path()
+        else:
+            path = self.search.path_without(without, self.state.agree & (association.object == without))
+        taken_out = np.arange(association.count) == without
+        objects = assign(
+            rays,
+            np.where(taken_out[:, None], np.nan, estimate.positions),
+            np.nan_to_num(estimate.covariance),
+            association.label[:, None] == np.arange(len(rays.label_names)),
+            path.map_T_base @ keyframes.base_T_camera,
+            rays.sigma,
+            pose_covariance=np.broadcast_to(path.pose_covariance, (len(keyframes), 6, 6)),
+        )
+        return path.map_T_base, Association(objects, association.label)
+
+
+def _solved(state: JointState) -> tuple[Keyframes, Rays, Association, Estimate]:
+    """Return the keyframes, the rays, the association and the estimate of a solved state."""
+    assert state.association is not None
+    assert state.estimate is not None
+    return state.keyframes, state.rays, state.association, state.estimate

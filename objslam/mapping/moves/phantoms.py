@@ -10,13 +10,12 @@ import numpy as np
 from objslam.core.noise import NoiseFactors
 from objslam.core.statistics import grouped_median
 from objslam.mapping.checks.finding import NEIGHBOURS, Finding
-from objslam.mapping.joint.relocalization import relocalize
+from objslam.mapping.joint.relocalization import Relocalization
 from objslam.mapping.moves.odometry_witness import lasting_by_odometry, lasting_long
 
 if TYPE_CHECKING:
     from objslam.config import Settings
     from objslam.core.arrays import Floats, Ints
-    from objslam.core.estimate import Estimate
     from objslam.core.types import Association
     from objslam.frontend.shared_errors import SharedErrors
     from objslam.mapping.joint.joint_alternation import JointState
@@ -142,8 +141,11 @@ def without_phantoms(state: JointState) -> JointState:
     best = replace(state.attempt(), hold=state.errors is not None)
     best = begin = best.solve("association", state.association, state.solved_poses)
     assert best.estimate is not None
-    whole = _along_likely_path(best, best.estimate)
-    if whole is None or whole.explained < best.explained - _COARSE:
+    search = Relocalization.of(best)
+    if search is None:
+        return state
+    whole = _solved_along(best, *search.found())
+    if whole.explained < best.explained - _COARSE:
         return state
     best = whole if whole.explained > best.explained else best
     tried = _candidates(state)
@@ -151,12 +153,15 @@ def without_phantoms(state: JointState) -> JointState:
     tried = tried[np.isfinite(best.estimate.positions[tried, 0])]
     while len(tried) and not best.spent:
         found, phantoms = best, list[int]()
+        search = search if search.state is best else Relocalization.of(best)
+        if search is None:
+            break
         for number, j in enumerate(tried.tolist()):
             if best.spent:
                 phantoms += tried[number:].tolist()
                 break
             state.progress("phantoms", number, len(tried))
-            other = _without(best, j)
+            other = _without(search, j)
             if other is not None and other.explained > best.explained:
                 phantoms.append(j)
                 found = other if other.explained > found.explained else found
@@ -188,32 +193,16 @@ def _candidates(state: JointState) -> Ints:
     return found[:_MOST]
 
 
-def _without(state: JointState, j: int) -> JointState | None:
+def _without(search: Relocalization, j: int) -> JointState | None:
     """Return the state after a solve without object `j`, with the objects of the rays along the most likely path. Return
-    None without a path, or if most rays of the object find no other object (`_LOST`)."""
+    None if most rays of the object find no other object (`_LOST`)."""
+    state = search.state
     assert state.association is not None
-    assert state.estimate is not None
-    positions = state.estimate.positions.copy()
-    positions[j] = np.nan
-    found = _relocalized(state, replace(state.estimate, positions=positions))
+    path, found = search.found(without=j)
     mine = (state.association.object == j) & state.agree
-    if found is None or (mine.any() and (found[1].object[mine] < 0).mean() > _LOST):
+    if mine.any() and (found.object[mine] < 0).mean() > _LOST:
         return None
-    return _solved_along(state, *found)
-
-
-def _along_likely_path(state: JointState, estimate: Estimate) -> JointState | None:
-    """Return the state after a solve with the objects of the rays along the most likely path through the map `estimate`.
-    Return None without a path."""
-    found = _relocalized(state, estimate)
-    return None if found is None else _solved_along(state, *found)
-
-
-def _relocalized(state: JointState, estimate: Estimate) -> tuple[Floats, Association] | None:
-    """Return the most likely path through the map `estimate`, and the objects of the rays along it. Return None without a
-    path."""
-    assert state.association is not None
-    return relocalize(state.keyframes, state.rays, state.cameras, state.settings, state.association, estimate)
+    return _solved_along(state, path, found)
 
 
 def _solved_along(state: JointState, path: Floats, association: Association) -> JointState:
