@@ -131,11 +131,10 @@ def without_phantoms(state: JointState) -> JointState:
     If headings err for seconds, a ray to one thing passes its neighbours. Rays to several things then meet at points without
     a thing, and a solve bends the path until they agree. Each ray then fits, so no round of association frees it. Here each
     object is taken out of the map in turn. The most likely path without the object gives its rays to other objects. If this
-    explains the log better, the object is a phantom. The phantom whose loss explains the log best is dropped, and the other
-    phantoms are tried again. The shared errors and the noise are fixed in these trials. The first trial keeps all objects.
-    If its result is much worse, the path search is too coarse for the log (`_COARSE`), and the search ends. If its result is
-    better, the other trials begin at this result. After `joint.max_solves` solves, the search ends, and the state is
-    unfinished.
+    explains the log better, the object is a phantom (`_without_least_likely`). The shared errors and the noise are fixed in
+    these trials. The first trial keeps all objects. If its result is much worse, the path search is too coarse for the log
+    (`_COARSE`), and the search ends. If its result is better, the other trials begin at this result. After
+    `joint.max_solves` solves, the search ends, and the state is unfinished.
     """
     assert state.association is not None
     best = replace(state.attempt(), hold=state.errors is not None)
@@ -148,27 +147,7 @@ def without_phantoms(state: JointState) -> JointState:
     if whole.explained < best.explained - _COARSE:
         return state
     best = whole if whole.explained > best.explained else best
-    tried = _candidates(state)
-    assert best.estimate is not None
-    tried = tried[np.isfinite(best.estimate.positions[tried, 0])]
-    while len(tried) and not best.spent:
-        found, phantoms = best, list[int]()
-        search = search if search.state is best else Relocalization.of(best)
-        if search is None:
-            break
-        for number, j in enumerate(tried.tolist()):
-            if best.spent:
-                phantoms += tried[number:].tolist()
-                break
-            state.progress("phantoms", number, len(tried))
-            other = _without(search, j)
-            if other is not None and other.explained > best.explained:
-                phantoms.append(j)
-                found = other if other.explained > found.explained else found
-        best, tried = found, np.array(phantoms, dtype=np.int64)
-        assert best.estimate is not None
-        tried = tried[np.isfinite(best.estimate.positions[tried, 0])]
-    unfinished = len(tried) > 0
+    best, unfinished = _without_least_likely(best, search, _candidates(state))
     if best is begin:
         return replace(state, unfinished=unfinished)
     assert best.association is not None
@@ -177,6 +156,46 @@ def without_phantoms(state: JointState) -> JointState:
     # Without an association, the first round is solved also if it agrees with the guess, which still lists the phantoms.
     rounds = replace(best, hold=state.hold, association=None).alternated(best.estimate.map_T_base, guess)
     return replace(state.better(rounds), unfinished=unfinished)
+
+
+def _without_least_likely(begin: JointState, search: Relocalization, candidates: Ints) -> tuple[JointState, bool]:
+    """Return the state without those candidates whose loss explains the log better. Also return whether the solves ended
+    first.
+
+    The candidate with the largest gain is dropped, again and again. Each loss changes the gains of the others. But a gain
+    rarely grows, so a candidate is tried again only when its last gain is the largest (lazy greedy search; Minoux 1978). In
+    a simulated warehouse with 60 candidates and ten phantoms, this took 69 trials.
+
+    search: the path search of `begin`, or of a state with other poses.
+    """
+    best, top, number = begin, None, 0
+    gains = {j: np.inf for j in candidates.tolist() if _is_placed(begin, j)}  # Infinite: not tried yet.
+    while gains:
+        j = max(gains, key=gains.__getitem__)
+        if top is not None and j == top[0]:
+            best, top = top[1], None
+            gains = {i: gain for i, gain in gains.items() if i != j and _is_placed(best, i)}
+            continue
+        if best.spent:
+            return best, True
+        there = search if search.state is best else Relocalization.of(best)
+        if there is None:
+            break
+        search, number = there, number + 1
+        best.progress("phantoms", number, number + len(gains))
+        other = _without(search, j)
+        gains[j] = -np.inf if other is None else other.explained - best.explained
+        if other is None or gains[j] <= 0:
+            del gains[j]
+        elif top is None or gains[j] >= gains[top[0]]:
+            top = j, other
+    return best, False
+
+
+def _is_placed(state: JointState, j: int) -> bool:
+    """Return whether object `j` has a position."""
+    assert state.estimate is not None
+    return bool(np.isfinite(state.estimate.positions[j, 0]))
 
 
 def _candidates(state: JointState) -> Ints:
