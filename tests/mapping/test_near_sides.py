@@ -52,6 +52,20 @@ def test_a_camera_that_is_moved_on_the_robot_counts():
     assert shift_ahead(keyframes, keyframes.map_T_base, found, ("front",))[0] == pytest.approx(-0.3)
 
 
+def test_the_shift_has_the_covariance_of_the_cameras_places():
+    """Two cameras that look ahead and back. What they have in common on the robot hardly counts."""
+    keyframes = way()
+    keyframes.camera = np.arange(40) % 2
+    keyframes.base_T_camera[1::2] = lift_se2(np.array([0.0, 0.0, np.pi])) @ FORWARD
+    names = ("front.x", "front.y", "rear.x", "rear.y", "front.tilt")
+    covariance = np.diag([0.03, 0.1, 0.02, 0.1, 0.5]) ** 2
+    covariance[0, 2] = covariance[2, 0] = 0.0003
+    found = Calibration(names, np.array([-0.3, 0.1, -0.1, 0.2, 0.4]), covariance, np.ones(5))
+    mean, sigma = shift_ahead(keyframes, keyframes.map_T_base, found, ("front", "rear"))
+    assert mean == pytest.approx(-0.1)
+    assert sigma == pytest.approx(np.sqrt(0.03**2 + 0.02**2 - 2 * 0.0003) / 2)
+
+
 def test_a_camera_that_looks_down_tells_nothing():
     down = np.eye(4)
     down[:3, :3] = np.diag([1.0, -1.0, -1.0])

@@ -43,9 +43,11 @@ def shift_ahead(
     """Return the mean shift (m) of the cameras along their horizontal viewing directions by a solve, and its standard
     deviation (m).
 
-    The result is (0, 0) if all cameras look up or down. keyframes: the keyframes with the given poses. map_T_base: (K, 4, 4)
-    the solved poses. calibration: the shared errors, whose translations of cameras count too. cameras: the names of the
-    cameras.
+    The shared errors of the cameras' places on the robot count too, with their covariance. The result is (0, 0) if all
+    cameras look up or down.
+
+    keyframes: the keyframes with the given poses. map_T_base: (K, 4, 4) the solved poses. calibration: the shared errors.
+    cameras: the names of the cameras.
     """
     ahead = (map_T_base @ keyframes.base_T_camera)[:, :2, 2]
     level = np.linalg.norm(ahead, axis=1)
@@ -54,9 +56,16 @@ def shift_ahead(
         return 0.0, 0.0
     moved = np.einsum("ki,ki->k", (map_T_base - keyframes.map_T_base)[used, :2, 3], ahead[used] / level[used, None])
     mount = keyframes.base_T_camera[used, :2, 2] / np.linalg.norm(keyframes.base_T_camera[used, :2, 2], axis=1)[:, None]
-    moved += np.einsum("ki,ki->k", _translations(calibration, cameras)[keyframes.camera[used]], mount)
     means = np.array([part.mean() for part in np.array_split(moved, min(_STRETCHES, len(moved)))])
-    return float(means.mean()), float(means.std() / np.sqrt(len(means)))
+    shift, variance = float(means.mean()), float(means.var() / len(means))
+    if calibration is not None:
+        camera = keyframes.camera[used]
+        share = np.stack([(mount * (camera == c)[:, None]).mean(axis=0) for c in range(len(cameras))])  # (C, 2)
+        by_name = {f"{name}.{axis}": share[c, i] for c, name in enumerate(cameras) for i, axis in enumerate("xy")}
+        by_value = np.array([by_name.get(name, 0.0) for name in calibration.names])
+        shift += float(by_value @ calibration.values)
+        variance += float(by_value @ calibration.covariance @ by_value)
+    return shift, float(np.sqrt(variance))
 
 
 def moves_back(shift: tuple[float, float], settings: Settings) -> bool:
@@ -87,14 +96,3 @@ def check_rows(solution: Solution, cameras: tuple[str, ...], settings: Settings)
         "count for a neighbour, and all things of the row may be off by half their spacing. Depths would show it",
         spoils=False,
     )
-
-
-def _translations(calibration: Calibration | None, cameras: tuple[str, ...]) -> Floats:
-    """Return the horizontal shifts (C, 2) m of the cameras on the robot by the calibration."""
-    moved = np.zeros((len(cameras), 2))
-    if calibration is None:
-        return moved
-    values = dict(zip(calibration.names, calibration.values.tolist(), strict=True))
-    for c, name in enumerate(cameras):
-        moved[c] = [values.get(f"{name}.{axis}", 0.0) for axis in "xy"]
-    return moved
