@@ -61,6 +61,9 @@ near the noise of their class for longer."""
 POOLED_WITH_PROMISE = 20.0
 """The number of rays at which the measured noise of an object and the nominal noise have equal weight, live. A larger number
 keeps objects near the nominal noise for longer."""
+BETWEEN_VISITS = 5.0
+"""The shortest time (s) between two visits to a thing. In a longer time, a moving thing gets farther. With a longer time,
+things have fewer visits, so more of them are dropped as things that move."""
 _LARGE_GROUPS = 100
 """The mean number of values in a group above which a partition of each group is faster than a sort of all values. For
 200,000 values in 200 groups, the partition took 2.8 ms and the sort 7.4 ms. A larger number sorts more often."""

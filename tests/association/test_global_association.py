@@ -170,6 +170,28 @@ def phantom(scene, point, frames, camera, label=0):
     return replace(chosen, label=np.full(len(chosen), label))
 
 
+@pytest.mark.parametrize(
+    ("sees", "expected"),
+    [
+        (lambda number, frame: (frame < 20) & (number < 3), 4),
+        (lambda number, frame: frame % 8 == 0, 3),
+        (lambda number, frame: (frame < 60) & (number == 1), 3),
+        (lambda number, frame: (frame >= 40 * number) & (frame < 40 * number + 20), 3),
+    ],
+    ids=["hidden behind walls", "scattered", "there in one round", "at another place in each round"],
+)
+def test_a_thing_that_walls_hide_from_most_places_is_an_object(sees, expected):
+    """Of three rounds around four things. Walls have no boxes. In the last case, a third of the looks from the same places
+    sees the thing."""
+    points = np.array([[0.3, 0.2, 0.4], [-0.4, 0.3, 0.3], [0.0, -0.5, 0.5], [0.2, -0.1, 0.3]])
+    scene = watch(points, np.concatenate([circle(150)] * 3), missed=0.1)
+    number, frame = np.divmod(scene.rays.keyframe, 150)
+    kept = (scene.whose != 3) | sees(number, frame)
+    rays = scene.rays.take(kept)
+    assert (scene.whose[kept] == 3).sum() >= 45
+    assert scene.associate(rays=rays).count == expected
+
+
 def test_what_should_have_been_seen_and_was_not_loses_support():
     points = np.array([[0.3, 0.2, 0.4], [-0.4, 0.3, 0.3], [0.0, -0.5, 0.5]])
     scene = watch(points, circle(150), missed=0.3)

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from objslam.association.existence import chance_odds, prior_odds, rarer_objects, rates_of_classes, rest_odds, size_odds
+from objslam.association.existence import chance_odds, rate_odds, rates_of_classes, rest_odds, size_odds
 from objslam.association.landmarks import State
 from objslam.association.refinement import velocity_gain
 from objslam.config import Settings
@@ -140,9 +140,7 @@ def _described(evidence: Evidence, groups: list[Ints], reason: Ints, owner: Ints
     points, known, count = fit_points(evidence, groups), evidence.state.count, len(groups)
     state = as_landmarks(evidence, points)
     obs, label = state.obs, state.label[known:]
-    rates = rates_of_classes(state)
-    rarer = rarer_objects(state, rates, evidence.gate)
-    by_rate = rates.log_odds(state.history, state.label, rarer) + prior_odds(state)
+    by_rate = rate_odds(state, evidence.gate)
     odds: dict[Reason, Floats] = {
         "rare": by_rate[known:],
         "size": size_odds(state)[known:],
@@ -184,7 +182,7 @@ def _described(evidence: Evidence, groups: list[Ints], reason: Ints, owner: Ints
         parallax=parallax,
         seen=state.history.seen[known:],
         expected=state.history.expected[known:],
-        rate=rates.mean[label],
+        rate=rates_of_classes(state).mean[label],
         size=state.size[known:],
         usual_size=np.nan_to_num(usual)[label],
         way=np.where(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from objslam.core.geometry import angles_off, lengths
-from objslam.core.statistics import grouped_visits
+from objslam.core.statistics import BETWEEN_VISITS, grouped_visits
 from objslam.core.types import Association
 from objslam.errors import SolveError
 from objslam.frontend.tracks import FEWEST, tracks_of_rays
@@ -51,9 +51,6 @@ _VISITS = 2
 """The fewest visits to an object that is kept although its label wanders. In one visit, the rays to a robot that drives on a
 line often meet in a point. Only a second visit shows that this was chance. With a larger number, more objects are
 dropped."""
-_AWAY = 5.0
-"""The shortest time (s) between two visits. In a longer time, a thing that moves gets farther. With a longer time, objects
-have fewer visits, and more objects of moving labels are dropped."""
 _APART = 3.0
 """The multiple of the usual root mean square residual above which the rays of a track meet in no point. Recorded robots that
 other robots saw had 0.4 to 60. With a larger multiple, fewer moving labels are found."""
@@ -208,7 +205,7 @@ def _moving(
         fits = squares <= _SCATTER**2 * usual * number
     # An object without long tracks, such as one whose rays are all rejected, would take up rays of the dropped objects.
     shown = np.flatnonzero(long & (owner >= 0))
-    visit = grouped_visits(keyframes.stamps[rays.keyframe[shown]], owner[shown], _AWAY)
+    visit = grouped_visits(keyframes.stamps[rays.keyframe[shown]], owner[shown], BETWEEN_VISITS)
     visits = np.bincount(owner[shown][np.unique(visit, return_index=True)[1]], minlength=association.count)
     of_moving = (moves | wander)[label] & ((pure < _PURE) | (visits == 0))
     return np.asarray(of_moving | (wander[label] & ((visits < _VISITS) | ~fits)))
