@@ -39,8 +39,9 @@ _MOST_MEMORY = 8 * _GIB
 limit is half of its memory. A larger value allows larger models, but a damaged model can then take the memory from all other
 programs. YOLO12n with images of 640 px takes 0.1 GiB."""
 _MOST_PIXELS = 1 << 26
-"""The largest number of pixels that the images of a run have together, if the model fixes their size and number. It is the
-number of pixels of an image of 8192x8192. A larger value takes more memory before the model runs."""
+"""The largest number of pixels of all images that a model takes at once: height times width times number of images. A value
+that the model does not fix counts as 1. The limit is that of one image of 8192x8192. With a larger limit, more memory is
+taken before the model runs."""
 _MOST_VALUES = 1 << 28
 """The largest number of values in an output. A larger number takes more memory. A float64 copy of an output of this size
 takes 2 GiB. The output of YOLO with 80 classes for an image of 8192x8192 is less than half as large."""

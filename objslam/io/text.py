@@ -184,8 +184,9 @@ def in_order(stamps: Floats, repeats: bool = False) -> Bools:
     """Return the mask (N,) of the timestamps (N,) that are later than all previous timestamps.
 
     If the clock jumps back, timestamps are rejected until they are later than the latest one before the jump. A single
-    timestamp too far in the future is rejected itself, if the next two timestamps are later than the one before it and
-    earlier than this one. The timestamps after it then stay. With `repeats`, a timestamp may equal the latest one.
+    timestamp too far in the future is an outlier: the next two timestamps are earlier than the outlier, but later than the
+    timestamp before the outlier. Then only the outlier is rejected, and the timestamps after it stay. With `repeats`, a
+    timestamp may equal the latest one.
     """
     before = np.concatenate([[-np.inf], stamps])[:-1]
     alone = np.zeros(len(stamps), dtype=bool)

@@ -1,10 +1,10 @@
 """Replace two landmarks at crossings by the two things whose rays cross there.
 
 Seen from two stretches of the path, two things of one label have four points where rays meet: the things, and two ghosts.
-The rays of each ghost come from both things. Both ghosts together have as many rays as the things. The rays from a short
-part of the path fit the ghosts well. So no ray fits the other landmark better, and a search that takes the points one by one
-may find the ghosts first. Only rays from a third side reveal the ghosts: both ghosts fit them worse than other landmarks fit
-their rays.
+The rays of each ghost come from both things. Both ghosts together have as many rays as both things together. The rays from
+a short part of the path fit the ghosts well. So no ray of one ghost fits the other ghost better. A search that takes the
+points one by one may find the ghosts first. Only rays from a third side reveal the ghosts. Such rays fit both ghosts worse
+than the rays of other landmarks fit their own landmarks.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ slower."""
 _POINTS = 120
 """The most proposed points that are tried in pairs. A larger number is slower: all pairs of points are scored."""
 _RAYS = 300
-"""The number of rays that score pairs of points. The same rays then compare the best pair with the two landmarks. All rays
-compare them only if the pair is better by these few. A larger number is slower."""
+"""The number of rays that score pairs of points. The same few rays then compare the best pair with the two landmarks. If
+they prefer the pair, all rays compare it with the landmarks. A larger number is slower."""
 _LEAST_GAIN = 30.0
 """The least decrease of -2 ln of the likelihood of two landmarks' rays with which two new points replace the landmarks. Rays
 share errors, so a small decrease may be chance. With a larger value, fewer ghosts are replaced."""

@@ -22,8 +22,8 @@ _PAIRS_AT_ONCE = 1 << 18
 
 
 def pairs_in_images(image: Ints) -> Iterator[tuple[Ints, Ints]]:
-    """Yield the ordered pairs (P,) and (P,) of different boxes of one image, some at a time. image: (B,) the image of each
-    box."""
+    """Yield the ordered pairs of different boxes of the same image, in several parts. A part has the indices (P,) of the
+    first boxes and the indices (P,) of the second boxes. image: (B,) the image of each box."""
     order = np.argsort(image, kind="stable")
     end = np.searchsorted(image[order], image[order], side="right")
     left = end - np.arange(len(image)) - 1  # The number of later boxes of the image.

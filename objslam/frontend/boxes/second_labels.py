@@ -160,8 +160,8 @@ class SecondLabelFinder:
         return self._second(pairs)
 
     def second_boxes(self, boxes: Floats, frame: Ints, label: Ints, scores: Floats) -> tuple[Ints, Ints]:
-        """Return what `add` returns, for the boxes (M, 4) px of several frames, by what was seen so far. The frames are not
-        added. frame, label, scores: (M,) of the boxes."""
+        """Return the same indices as `add`, but for the boxes (M, 4) px of several frames. The frames that were added before
+        decide. This method adds no frame. frame, label, scores: (M,) of the boxes."""
         return self._second(pairs_on_each_other(boxes, frame, label, scores))
 
     def _second(self, pairs: Pairs) -> tuple[Ints, Ints]:

@@ -224,9 +224,10 @@ class _Rescaling:
         return cls(system, rows, begin, np.asarray(np.linalg.inv(whitens)), (columns, np.append(0, np.cumsum(lengths))))
 
     def to(self, noise: NoiseFactors, whitens: Floats) -> tuple[sparse.csr_matrix, ChainRows | None]:
-        """Return the matrix (M, M) of the change to another noise, and the rows of a chain for this noise.
+        """Return the matrix (M, M) that changes the rows to the given noise, and the rows of the chain for the given noise.
 
-        whitens: (s, 6, 6) matrices that whiten the motions, for this noise.
+        The second value is None if the system has no chain. whitens: (s, 6, 6) matrices that whiten the motions, for the
+        given noise.
         """
         system, rows, size = self.system, self.rows, len(self.system.residual)
         scale = np.ones(size)

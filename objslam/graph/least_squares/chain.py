@@ -84,10 +84,10 @@ class _Step:
 
 @dataclass(frozen=True)
 class _Between:
-    """The elimination of k poses, one below each of k ties.
+    """The elimination of one pose below each of k ties (`is_chain`). A pose below a tie is between the two ends of the tie.
 
-    pose: (k,) the eliminated poses. before: (k,) the first pose of each tie. The pose after an eliminated pose is the next
-    one. inner, sides, border: as in `_Step`.
+    pose: (k,) the eliminated poses. before: (k,) the first pose of each tie. The pose after an eliminated pose is number
+    `pose` + 1. inner, sides, border: as in `_Step`.
     """
 
     pose: Ints

@@ -149,7 +149,7 @@ def _changed(camera: str) -> Finding:
 
 
 def _solved(found: Collected, by_label: bool, cameras: tuple[Camera, ...], settings: Settings, ledger: Ledger) -> Solution:
-    """Return the solution of a drive. by_label: whether every label is one object so far."""
+    """Return the solution of a drive. by_label: whether the session so far took every label for the name of one object."""
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
     few = len(found.rays) <= settings.live.reassociate
@@ -208,8 +208,8 @@ def _with_kept_ids(of: DescribedDrive, found: Collected) -> DescribedDrive:
 def _solve_joint(found: Collected, settings: Settings, ledger: Ledger) -> Solution:
     """Return the solution of the joint solve from the session's poses. The shared errors start as in an offline run.
 
-    With at most live.reassociate rays, with odometry and without localisation, also solve from the odometry, because the
-    session may have rejected rays early and for good. Return the solution with the lower cost.
+    A second solve starts from the odometry, because the session may have rejected rays early and for good. It needs at most
+    live.reassociate rays, a drive with odometry, and no localisation. The solution with the lower cost is returned.
     """
     from objslam.graph import batch_solver
     from objslam.graph.assembly import Measurements

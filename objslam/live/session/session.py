@@ -115,7 +115,7 @@ class Session(Intake):
     def snapshot(self) -> Snapshot:
         """Return the present map, or the last snapshot if the session has stopped or is busy for several seconds.
 
-        The counts are always up to date, because a session that does not run counts the messages that it refuses.
+        The counts are always up to date. Even a stopped session refuses messages, and counts them.
         """
         found = self._present()
         return replace(found, counters=self.counters.accepted(), dropped=self.counters.dropped())

@@ -19,8 +19,8 @@ _SIGMAS = 5.0
 _FEWEST = 30
 """The fewest depths for a check. With fewer depths, the spread of the visits is not known."""
 _VISIT = 3.0
-"""The time (s) within which the errors of an object's depths count as one. With a longer time, a drive has fewer visits, and
-the power is less certain."""
+"""The duration (s) of a visit. The errors of an object's depths in one visit count as one error. With a longer duration, a
+drive has fewer visits, and the fitted power of the cosine is less certain."""
 _ROUNDS = 15
 """The number of rounds of the robust fit. The fit settles within a few rounds."""
 _FAR = 1.5

@@ -11,9 +11,9 @@ from objslam.mapping.checks.agreement import agreements, bounded_part
 from objslam.mapping.checks.finding import JUMPS, Finding
 
 _LOSS = 0.02
-"""The least loss of score (`Agreement.score`) without the jumps that shows that the jumps are right. Some localisations
-drift for a while and then correct themselves by a jump. They are right before the drift and after the jump. With a larger
-value, more jumps are taken out."""
+"""The jumps are right if the score (`Agreement.score`) falls by more than this value when they are taken out. Some
+localisations drift for a while and then correct the drift by a jump. Such a localisation is right before the drift and after
+the jump. With a larger value, more jumps are taken out."""
 
 
 def wrong_jumps(log: Log, settings: Settings) -> Jumps | None:

@@ -48,8 +48,8 @@ _ALONE = 1.1
 """The largest crowd (`Part.crowd`) at which all boxes of a label in a window count as boxes of one thing. The ranges then
 are tested by whether they end at one point. A larger value tests more logs in this way."""
 _LEAST_BY_ODOMETRY = 0.18
-"""The least error of the ranges that is reported for poses by odometry, as a share. The joint mode itself corrects several
-percent. A larger error warns less often."""
+"""The least error of the ranges, as a share of the range, that is reported if the poses are from odometry. The joint mode
+itself corrects errors of several percent. With a larger value, fewer errors are reported."""
 _FACTORS = np.exp(np.linspace(np.log(1 / 5000), np.log(5000), 1200))
 """The tried factors on ranges. More factors find the best one more exactly."""
 _TELLS = 0.5
@@ -155,8 +155,8 @@ def _by_bearings(found: Agreement) -> Finding | None:
 def _in_words(ratio: float, than: str, *, spoils: bool = True) -> Finding:
     """Return the finding for ranges that are `ratio` times too long, or too short if the ratio is below 1.
 
-    than: what the ranges are compared with, in words. spoils: whether the ratio makes positions unreliable, if it is not the
-    ratio of two units.
+    than: what the ranges are compared with, in words. spoils: whether a wrong scale makes positions unreliable. A wrong unit
+    always does.
     """
     for factor, unit in _UNITS.items():
         if abs(np.log(ratio / factor)) < _CLOSE:

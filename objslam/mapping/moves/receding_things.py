@@ -87,13 +87,14 @@ def moving_along(sights: Sights, place: float) -> tuple[Bools, Floats]:
     """Return a mask (N,) of the things that move along the view, and the longest way (N,), m, that each thing seems to move
     in one view.
 
-    A view moves under two conditions. A point with a constant velocity explains its rays and ranges far better than a point
-    at rest. This point moves along the view by more than the surface of a thing at rest can explain. A thing moves if most
-    of its rays are in such views. A thing that rests in at least one of its visits does not move.
+    A view shows a motion under two conditions. A point with a constant velocity explains the rays and ranges of the view far
+    better than a point at rest. The moving point moves along the view by more than the surface of a thing at rest can
+    explain. A thing moves if most of its rays are in views that show a motion. A thing that rests in at least one of its
+    visits does not move.
 
-    The noise of single ranges is the scatter of the ranges of a label about moving points. Some ranges pass through a table
-    and end on the floor behind it. So the ranges of tables are noisy, and the ranges of people who walk are not. The ranges
-    of a view may share an error, and a few of them may be wrong.
+    Each label has its own noise of ranges: their scatter about the moving points. Some ranges pass through a table and end
+    on the floor behind it. So the ranges of tables are noisy, and the ranges of people who walk are not. The fit allows an
+    error that all ranges of a view share, and a few wrong ranges.
 
     place: m, the standard deviation of the places of the robot.
     """

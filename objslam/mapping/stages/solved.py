@@ -33,9 +33,9 @@ class SolvedDrive:
 def solved(
     drive: Drive, frames: Keyframes, rays: Rays, earlier: MapAtPoses | None, ledger: Ledger, progress: Progress
 ) -> SolvedDrive:
-    """Return the solution of a drive in its mode.
+    """Return the solution of a drive, in the mode of its settings.
 
-    earlier: an earlier map of the same drive at its given poses, None without one. SolveError if the solve fails.
+    earlier: an earlier map of the same drive, at the poses of the log, or None. Raises SolveError if the solve fails.
     """
     log, settings, diagnosis = drive.log, drive.settings, drive.diagnosis
     # Wrong input looks like large shared errors. Their estimation would take many rounds, and no object counts anyway.

@@ -1,4 +1,7 @@
-"""Log curves: residuals and ray counts by stamp, cost and object counts by iteration, and the time of each stage."""
+"""Log plots to a recording.
+
+Curves show residuals and ray counts by stamp, and cost and object counts by iteration. Bars show the time of each stage.
+"""
 
 from typing import Any
 

@@ -27,8 +27,8 @@ Wanted = Callable[[Connection], bool]  # A function that returns whether the cal
 
 @dataclass
 class FileReport:
-    """The result of reading one file. of_folder: True if the report is about a folder instead. Such a report counts the
-    messages that no file of the folder has."""
+    """The result of reading one file. of_folder: True if the report is about a folder instead. The report about a folder
+    counts the missing messages: metadata.yaml counts them, but no file of the folder has them."""
 
     file: str
     messages: int = 0  # The number of messages read.
