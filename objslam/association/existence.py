@@ -188,8 +188,6 @@ def _hidden_elsewhere(state: State, landmarks: Ints) -> tuple[Ints, DetectionHis
     Most misses of such a landmark are from other places (`_FROM_ELSEWHERE`), and it was detected in several visits
     (`_VISITS`).
     """
-    from scipy.spatial import cKDTree
-
     history, camera = state.history, state.view.map_T_camera[:, :2, 3]
     bounds = np.searchsorted(history.object, np.append(landmarks, landmarks + 1)).reshape(2, -1).T
     visit = grouped_visits(state.view.stamps[state.obs.frame[state.assigned]], state.owner, BETWEEN_VISITS)
@@ -201,7 +199,7 @@ def _hidden_elsewhere(state: State, landmarks: Ints) -> tuple[Ints, DetectionHis
             continue
         frame, detected = history.frame[begin:end], history.detected[begin:end]
         places, place = camera[frame], state.landmarks.position[j, :2]
-        near = cKDTree(places[detected]).query(places)[0] <= _SAME_VIEW * np.linalg.norm(places - place, axis=1)
+        near = _nearest(places, places[detected]) <= _SAME_VIEW * np.linalg.norm(places - place, axis=1)
         if (near & ~detected).sum() <= (1 - _FROM_ELSEWHERE) * (~detected).sum():
             hidden.append(j)
             kept.append(begin + np.flatnonzero(near))
@@ -209,6 +207,13 @@ def _hidden_elsewhere(state: State, landmarks: Ints) -> tuple[Ints, DetectionHis
     owner = np.repeat(np.arange(len(kept)), [len(one) for one in kept])
     of = np.array(hidden, dtype=np.int64)
     return of, DetectionHistory(owner, history.frame[rows], history.detected[rows], history.inside[of])
+
+
+def _nearest(places: Floats, others: Floats) -> Floats:
+    """Return the distances (n,) m from places (n, 2) to the nearest of other places (m, 2)."""
+    from scipy.spatial import cKDTree  # It takes long to load, and few logs need it.
+
+    return np.asarray(cKDTree(others).query(places)[0])
 
 
 def rarer_objects(state: State, rates: Rates, gate: float) -> Bools:
