@@ -226,5 +226,5 @@ def _without(search: Relocalization, j: int) -> JointState | None:
 
 def _solved_along(state: JointState, path: Floats, association: Association) -> JointState:
     """Return the state after a solve with the given objects of the rays. path: (K, 4, 4) map_T_base, where the solve
-    begins."""
-    return state.counted(association).solve("association", association, path @ state.keyframes.base_T_camera)
+    begins. Each such state has a trace of its own, so that the rounds of trials that fail are not kept."""
+    return state.attempt().counted(association).solve("association", association, path @ state.keyframes.base_T_camera)
