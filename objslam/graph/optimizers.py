@@ -101,22 +101,25 @@ def levenberg_marquardt(
     parameters.setMaxIterations(max_iterations)
     parameters.setRelativeErrorTol(relative_tolerance)
     parameters.setAbsoluteErrorTol(max(still, 1e-12))
-    last = 0
+    last, running = 0, list[gtsam.LevenbergMarquardtOptimizer]()
 
     def hook(number: Any, _: Any, after: Any) -> None:
         nonlocal last
         if int(number) > last and on_iteration is not None:  # After a failed step, GTSAM gives the last number again.
-            on_iteration(float(after), optimizer.values())
+            on_iteration(float(after), running[0].values())
         last = int(number)
 
     try:
         if on_iteration is not None:
             parameters.iterationHook = hook
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
+        running.append(optimizer)
         before = optimizer.error()
         values = optimizer.optimize()
     except RuntimeError as error:
         raise indeterminate(error) from error
+    finally:
+        running.clear()  # The optimizer has the hook. If the hook had the optimizer too, Python could never free them.
     return Optimum(values, before, optimizer.error(), optimizer.iterations())
 
 

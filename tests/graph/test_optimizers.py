@@ -1,5 +1,8 @@
 """The optimisers against closed forms, and what GTSAM throws as errors that say what to do."""
 
+import gc
+import weakref
+
 import gtsam
 import numpy as np
 import pytest
@@ -31,6 +34,23 @@ def test_values_are_read_back_in_the_order_of_their_keys():
     empty = make_values(NO_POSES, points, landmarks[:0])
     assert read_poses(empty).shape == (0, 4, 4)
     assert landmarks_in(empty)[1].shape == (0, 3)
+
+
+def test_a_solve_with_a_record_of_its_iterations_is_freed():
+    """GTSAM keeps the function that it calls after each iteration. A run makes dozens of such solves."""
+
+    class Record:
+        def __call__(self, cost, values):
+            self.cost = cost
+
+    record = Record()
+    freed = weakref.ref(record)
+    graph = build_graph(priors(np.eye(3), np.ones(3), np.zeros(3, dtype=int)))
+    levenberg_marquardt(graph, make_values(NO_POSES, np.ones((1, 3)), np.array([0])), 10, 1e-9, record)
+    assert record.cost < 2
+    del record
+    gc.collect()
+    assert freed() is None
 
 
 def test_levenberg_marquardt_finds_the_weighted_mean():
