@@ -27,10 +27,11 @@ more rarely than its class. With a larger share, fewer neighbours are dropped, a
 _SAME_VIEW = 0.25
 """The largest distance between two places of the camera from which a thing looks alike, as a share of the distance to the
 thing. This is a turn of 14 degrees. With a larger share, a wall or a shelf that hides the thing from one of the places is
-more often taken for a reason against the thing."""
+more often taken for a reason against the thing. No other share was tried."""
 _FROM_ELSEWHERE = 0.5
 """The least share of misses that are from other places, for an object that may be hidden from there. A phantom with a box in
-every twelfth frame has most misses near its detections. With a larger share, fewer hidden objects are kept."""
+every twelfth frame has most misses near its detections. With a larger share, fewer hidden objects are kept. No other
+share was tried."""
 _VISITS, _BOXES = 2, 3
 """The fewest visits in which an object was detected that may be hidden from other places, and the fewest boxes of a visit
 that counts. Rays to a thing that moves meet by chance in one visit, and one or two of another visit pass there too. With

@@ -111,7 +111,7 @@ class PathSearch:
 
     @cached_property
     def _kept(self) -> list[NDArray[np.float16]]:
-        """The costs (Y, X, X) of all stretches."""
+        """The costs (Y, X, X) of all stretches. They take 21 kB each: 41 MB for ten minutes in a warehouse."""
         return [cells.astype(np.float16) for cells in self.sight.costs(self.landmarks)]
 
     @cached_property

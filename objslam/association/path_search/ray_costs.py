@@ -35,16 +35,6 @@ class MapLandmarks:
 
 
 @dataclass(frozen=True)
-class _Variances:
-    """The variances of R rays, with the rounding to the grid. angle: (R,) rad^2, of the directions. range: (R,) m^2, of the
-    ranges. place: m^2, of a landmark."""
-
-    angle: Floats
-    range: Floats
-    place: float
-
-
-@dataclass(frozen=True)
 class Sight:
     """R rays at the present path, with origins and directions (R, 3) in map, and the stretch (R,) of each. pivot: (G, 3) m,
     the point about which each stretch turns."""
@@ -81,37 +71,26 @@ class Sight:
         origin, direction = self.origin[mine], self.direction[mine]
         return replace(self, rays=self.rays.take(mine), origin=origin, direction=direction, stretch=stretch, pivot=pivot)
 
-    @property
-    def _reach(self) -> float:
-        """The largest shift, m."""
-        return float(np.sqrt(2) * self.grid.shifts[-1])
-
-    def _variances(self, rays: Rays) -> "_Variances":
-        """Return the variances of some rays."""
-        place = _LANDMARK_SIGMA**2 + self.grid.shift**2 / 12
-        return _Variances(
-            angle=rays.sigma**2 + (STRETCH * self.grid.turn / 2) ** 2 + self.grid.turn**2 / 12,
-            range=rays.range_sigma**2 + np.nan_to_num(rays.range_bias) ** 2 + place,
-            place=place,
-        )
-
     def _ray_costs(self, some: Ints, turn: float, landmarks: MapLandmarks) -> Cells:
         """Return the cost (n, X * X) of rays (n,) for each shift after a turn. A ray costs at most `STRAY_RAY`."""
         rays, pivot = self.rays.take(some), self.pivot[self.stretch[some]]
         turned = lift_se2(np.array([0.0, 0.0, turn]))[:3, :3].T
         n, origin = self.direction[some] @ turned, pivot + (self.origin[some] - pivot) @ turned
-        ranged, sigma2, reach = np.isfinite(rays.range), self._variances(rays), self._reach
+        ranged = np.isfinite(rays.range)
+        reach, rounded = np.sqrt(2) * self.grid.shifts[-1], _LANDMARK_SIGMA**2 + self.grid.shift**2 / 12
+        angle = rays.sigma**2 + (STRETCH * self.grid.turn / 2) ** 2 + self.grid.turn**2 / 12
+        noise = rays.range_sigma**2 + np.nan_to_num(rays.range_bias) ** 2 + rounded
         to = landmarks.position - origin[:, None]
         along = np.einsum("rnk,rk->rn", to, n)
         distance2 = np.einsum("rnk,rnk->rn", to, to)
-        spread = sigma2.angle[:, None] * distance2 + sigma2.place
+        spread = angle[:, None] * distance2 + rounded
         near = (along > 0) & (rays.label[:, None] == landmarks.label)
         near &= distance2 - along**2 < (reach + _NEAR * np.sqrt(spread)) ** 2
         beyond = along - np.where(ranged, rays.range, 0.0)[:, None]
-        near &= ~ranged[:, None] | (np.abs(beyond) < reach + _NEAR * np.sqrt(sigma2.range)[:, None])
+        near &= ~ranged[:, None] | (np.abs(beyond) < reach + _NEAR * np.sqrt(noise)[:, None])
         i, j = np.nonzero(near)
         # The cost is quadratic in the shift. A range measures along the ray, the bearing measures across it.
-        by_range, by_bearing = np.where(ranged, 1 / sigma2.range, 0.0)[i], 1 / spread[i, j]
+        by_range, by_bearing = np.where(ranged, 1 / noise, 0.0)[i], 1 / spread[i, j]
         n, over = n[i], beyond[i, j]
         off = to[i, j] - along[i, j, None] * n
         (x, y), more = n[:, :2].T, by_range - by_bearing
