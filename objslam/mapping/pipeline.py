@@ -7,7 +7,6 @@ from objslam.core.types import Log
 from objslam.errors import SolveError
 from objslam.graph.least_squares.libraries import load_libraries
 from objslam.mapping.chosen_poses import chosen_poses, lost_localization, with_mode_of, without_localization
-from objslam.mapping.doubts.find import mostly_doubtful
 from objslam.mapping.fixed.map_at_poses import MapAtPoses
 from objslam.mapping.localization import PriorMap
 from objslam.mapping.progress import Progress, stage
@@ -15,7 +14,7 @@ from objslam.mapping.stages.described import mapped, not_placed
 from objslam.mapping.stages.drive import Drive
 from objslam.mapping.stages.measurements import checked, measured
 from objslam.mapping.stages.result import in_known_map, result_of
-from objslam.mapping.stages.second_solve import for_second_solve, reason_to_solve
+from objslam.mapping.stages.second_solve import for_second_solve, reason_to_solve, shows_noise
 from objslam.mapping.stages.solved import solved, without_refuted_findings, without_solved_errors
 
 
@@ -29,20 +28,22 @@ def run(
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
     With mode `auto`, some logs are first mapped at their localised poses, and then solved once more in joint mode. A log
-    without odometry needs settings that leave the noise of the localisation open, and one of the first two reasons. A log
-    with odometry needs one of five reasons:
+    without odometry needs settings that leave the noise of the localisation open, and one of the first three reasons. A log
+    with odometry needs one of six reasons:
 
     - The localisation errs for seconds (`check_lasting_noise`).
     - Most objects are doubtful at the localised poses.
+    - Many things are in the map twice (`maps_things_twice`).
     - The localisation errs by more than the settings say (`check_pose_noise`).
     - No object has a place at the localised poses.
     - The map is not good, and the odometry shows that the localisation errs for seconds (`odometry_contradicts`).
 
     If jumps of the localisation spoil the map, a log with odometry is mapped by its odometry alone. If a joint solve fails,
-    the log is mapped at its localised poses. known: the map of another day. If the drive is found in this map, the result is
-    in the map's frame, and the map's objects count as priors. LogError if the log lacks the chosen poses, if its stamps have
-    different units, or if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if
-    calibration.file is wrong or does not fit the log.
+    the log is mapped at its localised poses. A user who interrupts the second solve gets the first map.
+
+    known: the map of another day. If the drive is found in this map, the result is in the map's frame, and the map's objects
+    count as priors. LogError if the log lacks the chosen poses, if its stamps have different units, or if no frame lies on
+    the path. SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong or does not fit the log.
     """
     before = ledger.copy()
     try:
@@ -65,7 +66,7 @@ def run(
             ledger.restore(at_poses)
             return result
     # Without odometry, the second solve takes the noise of the localisation from the rays.
-    untold = settings.finds_localization_noise and (found.lasting is not None or mostly_doubtful(result))
+    untold = settings.finds_localization_noise and shows_noise(found, result)
     if settings.mode != "auto" or not wrong or (chosen_poses(log, settings).odometry is None and not untold):
         return result
     at_poses = ledger.copy()
@@ -76,6 +77,10 @@ def run(
     except SolveError as error:  # The map at the given poses is better than none.
         ledger.restore(at_poses)
         ledger.warn(f"{wrong}, but the poses cannot be solved too: {error}")
+        return result
+    except KeyboardInterrupt:
+        ledger.restore(at_poses)
+        ledger.warn(f"{wrong}, but the solve of the poses was interrupted, so this is the map at the given poses")
         return result
 
 

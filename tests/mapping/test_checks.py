@@ -419,7 +419,7 @@ def test_boxes_without_a_ray_are_no_sign_of_wrong_poses(cut, accused):
     boxes = int((1 + cut) * len(found.rays))
     point = np.where(np.arange(len(found.rays)) < 0.44 * boxes, 0, -1)
     found = replace(found, score=0.31, share=0.44, boxes=boxes, point=point)
-    finding = disagree(found, trials, part)
+    finding = disagree(found, trials, part, settings)
     assert (finding is not None) == accused
     assert finding is None or "only 44 % of the boxes" in finding.message
 

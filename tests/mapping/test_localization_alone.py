@@ -91,16 +91,39 @@ def test_errors_that_only_the_given_poses_show_are_named(heading, labels, told):
     assert check_neighbours(solution, None, settings) is None
 
 
-def test_auto_solves_the_poses_too_if_many_objects_at_them_are_doubtful(monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("mostly_doubtful", "many objects at the localised poses are doubtful"),
+        ("maps_things_twice", "many things are in the map twice at the localised poses"),
+    ],
+)
+def test_auto_solves_the_poses_too_if_the_map_at_them_is_doubtful(name, reason, monkeypatch):
     """Localised poses that err slowly show each thing at another place in each visit. The boxes of a visit agree."""
     log = simulate(preset("demo"), 3)
     log = replace(log, odometry=None)
     ledger = Ledger()
     assert pipeline.run(log, load_settings(None, QUIET), ledger).summary["mode"] == "fixed"
-    for module in (pipeline, second_solve):
-        monkeypatch.setattr(module, "mostly_doubtful", lambda result: result.summary["mode"] == "fixed")
+    monkeypatch.setattr(second_solve, name, lambda result: result.summary["mode"] == "fixed")
     solved = pipeline.run(log, load_settings(None, QUIET), ledger)
     assert solved.summary["mode"] == "joint"
-    assert any("many objects at the localised poses are doubtful" in one for one in ledger.lines())
+    assert any(reason in one for one in ledger.lines())
     held = load_settings(None, (*QUIET, "mode=fixed"))
     assert pipeline.run(log, held, Ledger()).summary["mode"] == "fixed"
+
+
+def test_an_interrupted_solve_of_the_poses_leaves_the_map_at_the_given_poses(monkeypatch):
+    log = replace(simulate(preset("demo"), 3), odometry=None)
+    settings = load_settings(None, QUIET)
+    first = pipeline.run(log, settings, Ledger())
+    monkeypatch.setattr(second_solve, "mostly_doubtful", lambda result: result.summary["mode"] == "fixed")
+
+    def interrupted(stage: str, done: int, total: int) -> None:
+        if stage.startswith("poses too"):
+            raise KeyboardInterrupt
+
+    ledger = Ledger()
+    result = pipeline.run(log, settings, ledger, interrupted)
+    assert result.summary["mode"] == "fixed"
+    assert [one.position.tolist() for one in result.map.objects] == [one.position.tolist() for one in first.map.objects]
+    assert any("interrupted, so this is the map at the given poses" in one for one in ledger.lines())

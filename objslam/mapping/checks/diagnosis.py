@@ -149,7 +149,7 @@ def _diagnosed(log: Log, settings: Settings, ledger: Ledger, progress: Progress,
     if found is not None and part.boxes >= _FEWEST:
         doubted = bool(trials) and not part.drifts and not any(one.spoils for one in findings)
         doubted &= len(found.rays) >= _FEWEST
-        none_fits = doubted and disagree(without_usual_errors(part, found, settings)[0], trials, part)
+        none_fits = doubted and disagree(without_usual_errors(part, found, settings)[0], trials, part, settings)
         # If none fits, boxes agree only by chance. They then say nothing about single frames, about halves, or about how a
         # camera is turned.
         findings += [none_fits] if none_fits else _parts_differ(part, found, settings)

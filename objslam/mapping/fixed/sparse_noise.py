@@ -14,14 +14,13 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
-from objslam.core.geometry import lift_se2
 from objslam.core.types import Log
 from objslam.errors import LogError
 from objslam.frontend.known_errors import coarse
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.finding import NOISIER, Finding
 from objslam.mapping.checks.hypotheses.disagreement import DISAGREE
-from objslam.mapping.checks.hypotheses.every import coarse_hypotheses, with_poses
+from objslam.mapping.checks.hypotheses.every import coarse_hypotheses, with_headings
 from objslam.mapping.fixed.few_box_search import Searched, SparseNoise, middle, search_objects
 from objslam.mapping.fixed.residual_noise import gain_of_shared_places, noise_of_residuals
 from objslam.mapping.progress import Progress
@@ -183,7 +182,7 @@ def _turned_cameras(log: Log, settings: Settings, progress: Progress) -> Finding
     values = []
     for number, degrees in enumerate(tried):
         progress("possible turns of the cameras", number, len(tried))
-        searched = search_objects(_with_headings(part, degrees), settings, SparseNoise())
+        searched = search_objects(with_headings(part, degrees), settings, SparseNoise())
         if searched.views > _MOST_VIEWS:
             return None
         values.append(searched.value)
@@ -222,13 +221,7 @@ def _what_ifs(log: Log, progress: Callable[[int, int], None]) -> Iterator[tuple[
     turns = range(_TURN, 360, _TURN)
     for number, degrees in enumerate(turns):
         progress(number, len(usual) + len(turns))
-        yield _with_headings(log, degrees), True
+        yield with_headings(log, degrees), True
     for number, hypothesis in enumerate(usual):
         progress(len(turns) + number, len(usual) + len(turns))
         yield hypothesis.put_right(log), False
-
-
-def _with_headings(log: Log, degrees: float) -> Log:
-    """Return the log with all headings turned, as if the cameras were turned on the robot."""
-    turn = lift_se2(np.array([0.0, 0.0, np.radians(degrees)]))
-    return with_poses(log, lambda poses: poses @ turn)

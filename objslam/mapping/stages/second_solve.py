@@ -1,7 +1,7 @@
 """Decide from a map at given poses whether the poses should be solved too."""
 
 from objslam.core.result import RunResult
-from objslam.mapping.doubts.find import mostly_doubtful
+from objslam.mapping.doubts.find import maps_things_twice, mostly_doubtful
 from objslam.mapping.fixed.map_at_poses import MapAtPoses
 from objslam.mapping.moves.odometry_witness import odometry_contradicts
 from objslam.mapping.stages.described import DescribedDrive
@@ -23,7 +23,15 @@ def reason_to_solve(of: DescribedDrive, result: RunResult) -> str:
         return ""
     if result.summary["assessment"]["level"] != "good" and odometry_contradicts(drive.given, drive.settings):
         return "the odometry shows that the localisation errs for seconds"
-    return "many objects at the localised poses are doubtful" if mostly_doubtful(result) else ""
+    if mostly_doubtful(result):
+        return "many objects at the localised poses are doubtful"
+    return "many things are in the map twice at the localised poses" if maps_things_twice(result) else ""
+
+
+def shows_noise(found: MapAtPoses, result: RunResult) -> bool:
+    """Return whether a map at localised poses shows that they err, so that a joint solve may find their noise without an
+    odometry. found: what the map tells a joint solve."""
+    return found.lasting is not None or mostly_doubtful(result) or maps_things_twice(result)
 
 
 def for_second_solve(of: DescribedDrive, result: RunResult) -> MapAtPoses:

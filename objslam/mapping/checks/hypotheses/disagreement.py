@@ -2,9 +2,11 @@
 
 import numpy as np
 
+from objslam.config import Settings
 from objslam.core.arrays import Bools
-from objslam.mapping.checks.agreement import Agreement, Part
+from objslam.mapping.checks.agreement import Agreement, Part, agreements
 from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.hypotheses.every import later, with_headings
 from objslam.mapping.checks.hypotheses.mounts import unset
 from objslam.mapping.checks.hypotheses.trials import Trial, chance
 
@@ -29,16 +31,25 @@ logs."""
 _PILE = 0.2
 """The least share of a label's rays that show one distant thing. A smaller share of the rays may have one direction by
 chance. A larger share accuses more logs."""
+_TURNS, _CLOCKS = (-24.0, -12.0, 12.0, 24.0), (-1.0, -0.5, 0.5, 1.0)
+"""The turns of all headings (degrees) and the offsets of the frames' clock (s) with which a log is compared. Each is too
+large to fit a right log. More of them make it rarer that wrong input fits best as it is given."""
+_PEAK = 0.8
+"""The largest score with a turn or a clock offset of right input, as a share of the score of the log as it is given. Right
+logs have at most 0.75: one simulated drive in a hospital with many people, and two of cars with GPS, whose poses err by far
+more than the settings say. With turned cameras, wrong clocks, or the poses of another drive, the share is at least 0.83. A
+larger share accuses fewer logs."""
 _TRIED = 64  # The most directions that are tried for a distant thing. A larger number finds smaller piles.
 
 
-def disagree(found: Agreement, trials: list[Trial], part: Part) -> Finding | None:
+def disagree(found: Agreement, trials: list[Trial], part: Part, settings: Settings) -> Finding | None:
     """Return a finding if the boxes agree with the poses only by chance, although they would show parallax.
 
     found: the agreement after a correction of the usual errors of the cameras, from `without_usual_errors`. trials: the
-    trials of all hypotheses. The turned mounts among them show the score by chance in this log. Things that are too far for
-    parallax give no point, but each thing has one direction. Boxes without a ray, such as those that the image's edge cuts
-    off, do not count.
+    trials of all hypotheses. The first is of the unchanged log. The turned mounts among them show the score by chance in
+    this log. Things that are too far for parallax give no point, but each thing has one direction. Boxes without a ray, such
+    as those that the image's edge cuts off, do not count. If the log fits best as it is given (`_fits_best`), noise and
+    things that move lower the score, and the boxes do not agree by chance.
     """
     by_chance = chance(trials)
     rays = len(found.rays)
@@ -47,7 +58,7 @@ def disagree(found: Agreement, trials: list[Trial], part: Part) -> Finding | Non
     every = found.boxes / rays
     if every * found.score >= min(_BAD_SCORE, max(every * _TIMES * by_chance, _HARDLY)):
         return None
-    if _at_rest(found).sum() >= _DISTANT * rays:
+    if _at_rest(found).sum() >= _DISTANT * rays or _fits_best(trials, part, settings):
         return None
     message = (
         f"only {100 * every * found.share:.0f} % of the boxes agree with the poses, hardly more than with a camera that is "
@@ -58,6 +69,19 @@ def disagree(found: Agreement, trials: list[Trial], part: Part) -> Finding | Non
     if unset(part.log):
         message += ". base_T_camera has no rotation, so the camera looks where z of the poses points"
     return Finding(DISAGREE, message, basis="boxes")
+
+
+def _fits_best(trials: list[Trial], part: Part, settings: Settings) -> bool:
+    """Return whether the boxes of a log fit best as the log is given. Wrong input has no reason to fit best.
+
+    No hypothesis may have a higher score, and small turns of the robot and small clock offsets must all lower the score.
+    """
+    given = trials[0].score
+    if any(trial.score > given for trial in trials[1:]):
+        return False
+    changed = [with_headings(part.log, turn) for turn in _TURNS] + [later(part.log, offset) for offset in _CLOCKS]
+    scores = [0.0 if one is None else one.score for one in agreements(part, changed, settings)]
+    return max(scores) <= _PEAK * given
 
 
 def _at_rest(found: Agreement) -> Bools:

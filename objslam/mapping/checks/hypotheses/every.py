@@ -167,6 +167,12 @@ def with_poses(log: Log, change: Callable[[Floats], Floats]) -> Log:
     return replace(log, odometry=changed(log.odometry), localization=changed(log.localization))
 
 
+def with_headings(log: Log, degrees: float) -> Log:
+    """Return the log with all headings turned by an angle, as if the cameras were turned on the robot."""
+    turn = lift_se2(np.array([0.0, 0.0, np.radians(degrees)]))
+    return with_poses(log, lambda poses: poses @ turn)
+
+
 def later(log: Log, offset: float) -> Log:
     """Return the log with the stamps of all frames later by an offset (s)."""
     return with_frame_stamps(log, lambda stamps: stamps + offset)
