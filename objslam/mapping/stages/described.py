@@ -7,6 +7,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
 from objslam.mapping.bodies.boxes_in_front import with_hidden_parts
 from objslam.mapping.bodies.fitting import with_bodies
+from objslam.mapping.bodies.visible_parts import without_visible_parts
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.depth_axis import check_depth_axis
 from objslam.mapping.checks.finding import JUMPS, Finding
@@ -82,6 +83,7 @@ def _completed(found: SolvedDrive, *, level: bool) -> tuple[SolvedDrive, Lasting
         solution, lasting = with_lasting_errors(solution, settings, lambda known: with_bodies(known, cameras, settings))
     if solution.bodies is None:
         solution = with_bodies(solution, cameras, settings)
+    solution = without_visible_parts(solution)
     if not drive.joint:  # This comes after the bodies, because edges of boxes show depths that rays do not show.
         solution = with_far_sides(solution)
     solution = with_hidden_parts(solution, cameras)
