@@ -200,7 +200,7 @@ def _hidden_elsewhere(state: State, landmarks: Ints) -> tuple[Ints, DetectionHis
             continue
         frame, detected = history.frame[begin:end], history.detected[begin:end]
         places, place = camera[frame], state.landmarks.position[j, :2]
-        near = _nearest(places, places[detected]) <= _SAME_VIEW * np.linalg.norm(places - place, axis=1)
+        near = looks_alike(places, detected, place)
         if (near & ~detected).sum() <= (1 - _FROM_ELSEWHERE) * (~detected).sum():
             hidden.append(j)
             kept.append(begin + np.flatnonzero(near))
@@ -210,11 +210,15 @@ def _hidden_elsewhere(state: State, landmarks: Ints) -> tuple[Ints, DetectionHis
     return of, DetectionHistory(owner, history.frame[rows], history.detected[rows], history.inside[of])
 
 
-def _nearest(places: Floats, others: Floats) -> Floats:
-    """Return the distances (n,) m from places (n, 2) to the nearest of other places (m, 2)."""
+def looks_alike(places: Floats, detected: Bools, thing: Floats) -> Bools:
+    """Return from which places (n, 2) m of the camera a thing at a place (2,) m looks about as it did in its detections.
+
+    detected: (n,) from which places it was detected, at least from one.
+    """
     from scipy.spatial import cKDTree  # It takes long to load, and few logs need it.
 
-    return np.asarray(cKDTree(others).query(places)[0])
+    nearest = cKDTree(places[detected]).query(places)[0]
+    return np.asarray(nearest <= _SAME_VIEW * np.linalg.norm(places - thing, axis=1))
 
 
 def rarer_objects(state: State, rates: Rates, gate: float) -> Bools:

@@ -24,6 +24,7 @@ from objslam.mapping.doubts.unmapped import in_assessment, unmapped_labels
 from objslam.mapping.doubts.words import in_place, in_words
 from objslam.mapping.moves import driven_through as passed
 from objslam.mapping.moves import other_places as moved
+from objslam.mapping.moves import temporary_things as temporary
 
 _DOUBLE = 0.5
 """The least probability of being one object for a pair of objects that counts in the assessment. With a larger value, more
@@ -108,11 +109,21 @@ def with_doubts(result: RunResult) -> RunResult:
     paired = {one.objects for one in doubts if one.kind == "pair"}
     elsewhere = moved.at_other_places(result, evidence.state, evidence.object)
     elsewhere = [one for one in elsewhere if one.objects not in paired and one.objects[::-1] not in paired]
+    paired |= {one.objects for one in elsewhere}
+    for_a_time = temporary.there_for_a_time(result, evidence.state, evidence.object, {j for pair in paired for j in pair})
     mixed, unsure = mixed_sizes(result), wide.unsure_objects(result)
     # If a whole label has no object, its doubt is enough. Its things get no doubts of their own.
     lacking = {one.label for one in unmapped}
     cut = [thing for thing in cut if result.rays.label_names[thing.label] not in lacking]
-    of_things = [*unsure, *cut_off.in_doubts(cut, result), *_unnamed(disagreeing, doubts), *through, *elsewhere, *mixed]
+    of_things = [
+        *unsure,
+        *cut_off.in_doubts(cut, result),
+        *_unnamed(disagreeing, doubts),
+        *through,
+        *elsewhere,
+        *for_a_time,
+        *mixed,
+    ]
     doubts = (*doubts, *of_things, *(one for one in unmapped if one.label not in told))
     counts: dict[str, int] = {kind: sum(one.kind == kind for one in doubts) for kind in DOUBT_KINDS}
     summary = {**result.summary, "doubts": counts}
@@ -133,6 +144,7 @@ def with_doubts(result: RunResult) -> RunResult:
         if few:
             assessment = _praised(assessment, len(odd), len(result.map.resolved()))
             named = [*of_objects, *lost, *named]
+        named += [*temporary.in_assessment(for_a_time)]
         named += [*_of_moved_things(found.groups, result), *in_assessment(unmapped), *cut_off.in_assessment(cut, result)]
         summary["assessment"] = {**assessment, "reasons": [*assessment["reasons"], *named]}
         if mostly_doubtful(replace(result, summary=summary)):
