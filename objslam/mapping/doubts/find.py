@@ -37,9 +37,9 @@ a fifth to a third of false objects had 0.29 and 0.34. With a larger share, fewe
 _FEWEST_DOUBTFUL = 8
 """The fewest doubtful objects of a bad map. With a larger number, fewer small maps are bad."""
 _DOUBLES = 0.2
-"""The least share of objects that are likely doubles, or that some visits do not show, in a map whose poses are likely wrong.
-Two streets had 0.33 and 0.41 at places of a GPS that wanders by half a metre. After a solve of the poses, a street with 20
-cars that parked for a time had 0.13. An orchard had 0.02. With a larger share, fewer poses are solved too."""
+"""The least share of objects that are likely doubles, or that some visits do not show, in a map whose poses are likely
+wrong. Two streets had 0.33 and 0.41 at places of a GPS that wanders by half a metre. After a solve of the poses, a street
+with 20 cars that parked for a time had 0.13. An orchard had 0.02. With a larger share, fewer poses are solved too."""
 _LOST = (0.1, 0.5)
 """The shares of boxes from which a group that became no object counts in the assessment. The group counts if it has at least
 the first share of all boxes of its label. It also counts if it has at least the second share of the median number of boxes
