@@ -66,7 +66,7 @@ def separations(first, second, gap=0.0):
         centred = polygon - polygon.mean(axis=0)
         for normal in np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]:
             side = centred @ normal
-            if side.max() < -side.min() - 1e-9:  # A symmetric outline has equal sides, up to rounding.
+            if side.max() < -side.min():
                 normal = -normal
             here, there = (polygon @ normal).max(), (other @ normal).min()
             if there - here > gap:

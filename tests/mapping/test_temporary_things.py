@@ -16,14 +16,19 @@ SETTINGS = load_settings(None, ("mode=fixed", "output.recording=false"))
 
 
 def scene() -> list[Solid]:
-    """Six carts and three stools in a ring around the robot."""
-    carts = np.linspace(0, 2 * np.pi, 6, endpoint=False)
-    stools = np.linspace(0.5, 2 * np.pi + 0.5, 3, endpoint=False)
+    """Six round carts and three stools in a ring around the robot."""
     half = {"cart": np.array([0.4, 0.3, 0.45]), "stool": np.array([0.2, 0.2, 0.25])}
+    turns = {"cart": np.linspace(0, 2 * np.pi, 6, endpoint=False), "stool": np.linspace(0.5, 4.7, 3)}
+    kinds = [(label, far, turn) for label, far in (("cart", 3.4), ("stool", 2.9)) for turn in turns[label].tolist()]
     return [
-        Solid("cuboid", label, np.array([far * 1.2 * np.cos(turn), far * np.sin(turn), half[label][2]]), half[label], 0.1)
-        for label, far, turns in (("cart", 3.4, carts), ("stool", 2.9, stools))
-        for turn in turns
+        Solid(
+            "cylinder",
+            label,
+            np.array([far * 1.2 * np.cos(turn), far * np.sin(turn), half[label][2]]),
+            half[label],
+            0.1 + 0.13 * number,
+        )
+        for number, (label, far, turn) in enumerate(kinds)
     ]
 
 
