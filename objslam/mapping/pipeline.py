@@ -65,9 +65,11 @@ def run(
         except SolveError:
             ledger.restore(at_poses)
             return result
+    if settings.mode != "auto" or not wrong:
+        return result
     # Without odometry, the second solve takes the noise of the localisation from the rays.
-    untold = settings.finds_localization_noise and shows_noise(found, result)
-    if settings.mode != "auto" or not wrong or (chosen_poses(log, settings).odometry is None and not untold):
+    alone = chosen_poses(log, settings).odometry is None
+    if alone and not (settings.finds_localization_noise and shows_noise(found, result)):
         return result
     at_poses = ledger.copy()
     ledger.restore(before)  # What a run drops counts once.

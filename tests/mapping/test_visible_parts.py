@@ -11,6 +11,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
+from objslam.mapping.bodies import visible_parts
 from objslam.mapping.stages import described
 
 VISIBLE = 0.4  # The share of a post's height that is visible in the second lap.
@@ -62,3 +63,16 @@ def test_posts_of_two_heights_that_frames_show_together_stay():
     ]
     result = pipeline.run(hiding_drive(0, solids=[*solids, *short]), SETTINGS, Ledger())
     assert [item.label for item in result.map.resolved()].count("post") == 8
+
+
+def test_a_wide_sigma_takes_in_no_neighbour(monkeypatch):
+    """Posts of one height in a ring, as if no frame showed two of them, at places that are known to 9 m only."""
+    seen = []
+    monkeypatch.setattr(described, "without_visible_parts", lambda solution: seen.append(solution) or solution)
+    solids = scene()
+    pipeline.run(hiding_drive(0, solids=solids), SETTINGS, Ledger())
+    (solution,) = seen
+    monkeypatch.setattr(visible_parts, "_are_two", lambda *_: False)
+    estimate = solution.estimate
+    wide = replace(estimate, covariance=np.tile(81.0 * np.eye(3), (len(estimate.positions), 1, 1)))
+    assert visible_parts.without_visible_parts(replace(solution, estimate=wide)).association.count == len(solids)

@@ -27,8 +27,8 @@ which must not take in a right object. With a larger share, fewer objects are dr
 def without_visible_parts(solution: Solution) -> Solution:
     """Return a solution with bodies without the objects that are a visible part of another object of their label.
 
-    The part stands where the other object stands, to within the size of the body and the noise of the places. It ends
-    neither above nor below the other body. Hardly any frame shows both objects. The rays of dropped objects belong to no
+    The part stands where the other object stands, to within the length of the body. It ends neither above nor below the
+    other body. Hardly any frame shows both objects. The rays of dropped objects belong to no
     object.
     """
     estimate, association, bodies = solution.estimate, solution.association, solution.bodies
@@ -38,20 +38,19 @@ def without_visible_parts(solution: Solution) -> Solution:
     if len(known) < 2:
         return solution
     ends, place, length, spread = _measured(solution, known)
-    farthest = 2 * float((length / 2 + spread).max())
-    a, b, apart = near_pairs(place, association.label[known], farthest)
+    a, b, apart = near_pairs(place, association.label[known], 2 * float(length.max()))
     higher = np.diff(ends, axis=1)[:, 0]
     number = np.bincount(association.object[association.object >= 0], minlength=association.count)[known]
+    swap = higher[a] < higher[b]
+    thing, part = np.where(swap, b, a), np.where(swap, a, b)
+    slack = _BEYOND * higher[thing]
+    inside = (ends[part, 0] >= ends[thing, 0] - slack) & (ends[part, 1] <= ends[thing, 1] + slack)
+    # A wide sigma must not reach a neighbour, so the noise counts up to half of the length.
+    reach = (length[thing] + np.minimum(length[thing], 2 * np.hypot(spread[a], spread[b]))) / 2
+    likely = np.flatnonzero(inside & (lengths(apart) <= reach) & (number[thing] >= _BOXES * number[part]))
     gone = np.zeros(association.count, dtype=bool)
-    for i, j, away in zip(a.tolist(), b.tolist(), lengths(apart).tolist(), strict=True):
-        thing, part = (i, j) if higher[i] >= higher[j] else (j, i)
-        slack = _BEYOND * higher[thing]
-        inside = ends[part, 0] >= ends[thing, 0] - slack and ends[part, 1] <= ends[thing, 1] + slack
-        if not inside or away > length[thing] / 2 + np.hypot(spread[i], spread[j]):
-            continue
-        enough = number[thing] >= _BOXES * number[part]
-        if enough and not _are_two(solution, int(known[thing]), int(known[part])):
-            gone[known[part]] = True
+    for i, j in zip(known[thing[likely]].tolist(), known[part[likely]].tolist(), strict=True):
+        gone[j] |= not _are_two(solution, i, j)
     return _without(solution, gone) if gone.any() else solution
 
 
