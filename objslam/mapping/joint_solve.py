@@ -94,6 +94,8 @@ def _associated_again(
     error estimated. named: as in `from_several_starts`."""
     before = state.ledger.copy()
     found = _associated(state, start, named)
+    if found.effort.interrupted:
+        return found
     wider, found = _with_gross_errors(begin, found)
     if wider is None:
         return found

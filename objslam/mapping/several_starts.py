@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Self
+from functools import partial
+from typing import TYPE_CHECKING, Self, TypeVar
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from objslam.mapping.moves.missed_loops import largest_copy_in, with_missed_loop
 
 if TYPE_CHECKING:
     from objslam.graph.init_unknown_correspondences import InitialEstimate
+
+_T = TypeVar("_T")
 
 _CLEAR = 0.98
 """The least share of agreeing rays in a clear map, among the rays of tracks. With a larger share, more logs are tried from
@@ -80,11 +83,9 @@ def _from_explorations(state: JointState, found: _Found | None, named: JointStat
     start, sure = explored(begin)
     first = from_start(*solved_if_sure(begin, start, sure))
     found = (_Found(first, _searched(first)) if found is None else found.beside(first)).compared(named)
-    noisier = with_loose_odometry(first, begin.theta, sure)
-    if noisier is not None and not begin.spent:
-        other, sure = explored(noisier)
-        if not finds_same_objects(found.state, other.association):
-            found = found.after(lambda: from_start(*solved_if_sure(noisier, other, sure)))
+    noisier = None if begin.spent else with_loose_odometry(first, begin.theta, sure)
+    if noisier is not None:
+        found, sure = until_interrupted(begin, (found, sure), lambda now: _with_loose_odometry(*now, noisier))
 
     def along_tracks() -> JointState:
         return from_start(begin.attempt(), explored(along(begin, path))[0])
@@ -98,9 +99,18 @@ def _from_explorations(state: JointState, found: _Found | None, named: JointStat
     for other_start in starts:  # The first ones take less time.
         if not found.unclear or begin.spent:
             break
-        found = found.after(other_start)
-    found = found.with_the_others()
+        found = until_interrupted(begin, found, partial(_Found.after, start=other_start))
+    found = until_interrupted(begin, found, _Found.with_the_others)
     return replace(found.state, unfinished=begin.spent and found.unclear)
+
+
+def _with_loose_odometry(found: _Found, sure: bool, noisier: JointState) -> tuple[_Found, bool]:
+    """Return what is found with a start from a second exploration, and whether this exploration is sure. noisier: the state
+    with more noise of the odometry."""
+    other, sure = explored(noisier)
+    if finds_same_objects(found.state, other.association):
+        return found, sure
+    return found.after(lambda: from_start(*solved_if_sure(noisier, other, sure))), sure
 
 
 @dataclass(frozen=True)
@@ -177,7 +187,8 @@ class _Found:
 
 def _searched(state: JointState) -> JointState:
     """Return the state after searches for a more likely path through its map, and for loops that it missed."""
-    return with_missed_loops(improved(state, relocalized))
+    state = improved(state, relocalized)
+    return until_interrupted(state, state, with_missed_loops)
 
 
 def _from_tracks(begin: JointState) -> JointState:
@@ -223,8 +234,21 @@ def improved(state: JointState, step: Callable[[JointState], JointState]) -> Joi
     """Return the state after a step was repeated until the step no longer found a better state. step: a function that
     returns its argument if it finds nothing better."""
     for _ in range(state.settings.joint.max_rounds):
-        found = step(state)
+        found = until_interrupted(state, state, step)
         if found is state:
             break
         state = found
     return state
+
+
+def until_interrupted(state: JointState, found: _T, step: Callable[[_T], _T]) -> _T:
+    """Return what a step of a search finds. If the user interrupts it (Ctrl-C), return what was found before, and let the
+    whole search end. A second interrupt is raised. state: any state of the search. found: the argument of the step."""
+    if state.effort.interrupted:
+        return found
+    try:
+        return step(found)
+    except KeyboardInterrupt:
+        state.effort.interrupted = True
+        state.progress("interrupted, so the best map until now is finished (Ctrl-C again gives it up)", 0, 0)
+        return found

@@ -95,11 +95,11 @@ class Solution:
     object, None for a point. to_centre: the correction that turns each ray to the centre of its body. hidden: (R,) whether
     something may hide a part of the object in the box of each ray. bodies, to_centre and hidden are None if no bodies were
     solved. doubted: the labels that may name one object or several. unsettled: the number of objects that the last round
-    changed (`objects_changed`), if no further round was allowed. unfinished: whether the search for a clear map took all its
-    solves (`joint.max_solves`). copied: the number of objects in the largest part of the map that shows the same things as
-    another part. errors: the shared errors that were estimated, None if none were. They include held errors that were found
-    to be gross. whole: in fixed mode, the association before things that move along the view were dropped. A joint solve
-    begins better with it, because the joint solve finds such things again at its own poses.
+    changed (`objects_changed`), if no further round was allowed. unfinished: whether the search for a clear map ended early,
+    after its solves (`joint.max_solves`) or at an interrupt. copied: the number of objects in the largest part of the map
+    that shows the same things as another part. errors: the shared errors that were estimated, None if none were. They
+    include held errors that were found to be gross. whole: in fixed mode, the association before things that move along the
+    view were dropped. A joint solve begins better with it, because the joint solve finds such things again at its own poses.
     """
 
     keyframes: Keyframes

@@ -195,6 +195,46 @@ def test_a_search_ends_after_its_solves(monkeypatch):
     assert taken[1] < taken[0]
 
 
+@pytest.mark.parametrize("stage", ["most likely path", "explore", "association"])
+def test_an_interrupted_search_leaves_the_best_map_so_far(monkeypatch, stage):
+    """The interrupt comes in the first search, in a further exploration, or in the rounds of a further start."""
+    monkeypatch.setattr(several_starts, "_unclear", lambda state, confirmed: True)
+    log = without_names(simulate(preset("demo", objects=6, frames=80, localization=None, odometry=Odometry(), false=0.0), 1))
+    settings = load_settings(None, ("mode=joint", "output.recording=false", "bodies.use=false"))
+    seen, stages = [], []
+
+    def interrupted(said: str, done: int, total: int) -> None:
+        stages.append(said)
+        if said.startswith("most likely path"):
+            seen.append(said)
+        if seen and said.startswith(stage) and not any(one.startswith("interrupted") for one in stages):
+            raise KeyboardInterrupt
+
+    result = pipeline.run(log, settings, Ledger(), interrupted)
+    at = next(number for number, said in enumerate(stages) if said.startswith("interrupted"))
+    assert not any(said.startswith(("explore", "most likely path")) for said in stages[at:])
+    assert result.summary["unfinished_search"]
+    assert any("Ctrl-C" in reason for reason in result.summary["assessment"]["reasons"])
+    found = result.map.positions
+    truth = np.stack([one.position for one in log.truth.objects])
+    near = np.linalg.norm(found[:, None] - truth, axis=2).min(axis=1)
+    assert len(found) == 6
+    assert (near < 0.5).all()  # The odometry of the short drive is all that holds the map.
+
+
+def test_a_second_interrupt_ends_the_run(monkeypatch):
+    monkeypatch.setattr(several_starts, "_unclear", lambda state, confirmed: True)
+    log = without_names(simulate(preset("demo", objects=6, frames=80, localization=None, odometry=Odometry(), false=0.0), 1))
+    settings = load_settings(None, ("mode=joint", "output.recording=false", "bodies.use=false"))
+
+    def interrupted(said: str, done: int, total: int) -> None:
+        if said.startswith(("most likely path", "interrupted")):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.run(log, settings, Ledger(), interrupted)
+
+
 def test_a_search_begins_without_the_errors_of_a_map_by_names(monkeypatch):
     """One object for several things bends the path, and its noise and turn scale would bend the path of the search."""
     begun, search, solved = [], joint_solve.from_several_starts, joint_solve.by_label

@@ -76,8 +76,9 @@ class Evidence:
     of frames that a live session dropped because they came too late. journal: the file with all messages of a live session,
     "" without one. doubted: the labels that may name one object or several. unsettled: the number of objects that the last
     round of association still changed. unfinished: whether the search for a clear map took all its solves
-    (joint.max_solves). copied: the number of objects in the largest part of the map that shows the same things as another
-    part. several: whether a label has several objects. uncalibrated: whether the estimation of the shared errors failed.
+    (joint.max_solves) or was interrupted. copied: the number of objects in the largest part of the map that shows the same
+    things as another part. several: whether a label has several objects. uncalibrated: whether the estimation of the shared
+    errors failed.
     odometry: the largest noise of the odometry that the log shows, as a multiple of the settings. poses: the same for the
     localisation. scale: the standard deviation of the scale of the odometry, as a share, None if the log shows the scale.
     depths: whether boxes have depths. part: the limits of a log that is a part of a recording, as in `Log`. malformed: the
@@ -293,8 +294,8 @@ def _check(e: Evidence) -> list[str]:
         )
     if e.unfinished:
         found.append(
-            "The search for a map that explains the boxes ended after its solves (joint.max_solves), so the best map may be "
-            "wrong. Depths, more labels or a better odometry would help."
+            "The search for a map that explains the boxes ended early, after its solves (joint.max_solves) or at Ctrl-C. So "
+            "the best map may be wrong. Depths, more labels or a better odometry would help."
         )
     if e.copied:
         found.append(

@@ -40,9 +40,10 @@ Guess = tuple[Association, Floats]
 
 @dataclass
 class Effort:
-    """The number of solves that a search has taken. All attempts of a search share one `Effort`."""
+    """The solves that a search has taken, and whether the user interrupted it. All attempts of a search share one object."""
 
     solves: int = 0
+    interrupted: bool = False
 
 
 @dataclass(frozen=True)
@@ -122,8 +123,8 @@ class JointState:
 
     @property
     def spent(self) -> bool:
-        """Whether the search has taken all the solves that it may take."""
-        return self.effort.solves >= self.settings.joint.max_solves
+        """Whether the search has taken all the solves that it may take, or the user interrupted it."""
+        return self.effort.interrupted or self.effort.solves >= self.settings.joint.max_solves
 
     def merged(self, bundles: bool = False) -> Self:
         """Return the state after objects that appear twice were merged and solved again.
