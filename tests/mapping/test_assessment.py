@@ -48,7 +48,7 @@ def test_a_usual_result_is_good() -> None:
         (
             {"unfinished": True},
             "check",
-            "The search for a map that explains the boxes ended after its solves",
+            "The search for a map that explains the boxes ended early, after its solves (joint.max_solves) or at Ctrl-C",
         ),
         ({"uncalibrated": True}, "check", "The errors that all measurements share could not be estimated"),
         ({"doubted": ("mug", "cup")}, "check", "It is not clear whether mug, cup name one object each, or several."),

@@ -314,8 +314,7 @@ class JointState:
         frames, rays = self.frames, self.all_rays
         if self.errors is not None and self.theta is not None:
             frames, rays, _ = self.errors.take(frames, rays).at(self.theta, drift=False)
-            # If the estimated noise is below the nominal noise, it describes inliers only. The gate needs the nominal noise
-            # then.
+            # Estimated noise below the nominal noise describes inliers only. The gate needs the nominal noise then.
             rays = replace(rays, sigma=np.maximum(rays.sigma, self.all_rays.sigma))
         mine = self.keyframes
         at = correct_poses(frames.stamps, frames.map_T_base, mine.stamps, mine.map_T_base, map_T_base)
