@@ -28,12 +28,20 @@ def lasting_noise(rng: np.random.Generator, stamps: Floats, seconds: float) -> F
 
 
 def uneven_drive(
-    tilt: float, seconds: float = 0.0, seed: int = 0, *, posts: int = 22, frames: int = 400, mount: float = 0.0
+    tilt: float,
+    seconds: float = 0.0,
+    seed: int = 0,
+    *,
+    posts: int = 22,
+    frames: int = 400,
+    mount: float = 0.0,
+    hills: float = 0.0,
 ) -> Log:
     """Return a drive whose base rolls and pitches by `tilt` (rad, one standard deviation) for some seconds.
 
-    mount: rad, by how much the camera looks up more than its calibration says. Each post has a label of its own. Boxes err
-    by 2 px, poses by 2 cm and 0.3 deg.
+    mount: rad, by how much the camera looks up more than its calibration says. hills: m, the standard deviation of the
+    height of the ground. The robot stands on it at each visit, and the true heights of posts are those above the ground.
+    Each post has a label of its own. Boxes err by 2 px, poses by 2 cm and 0.3 deg.
     """
     rng = np.random.default_rng(seed)
     stamps = 100.0 + 0.25 * np.arange(frames)
@@ -42,6 +50,11 @@ def uneven_drive(
     yaw = np.unwrap(np.arctan2(10 * np.cos(2 * phase), 8 * np.cos(phase)))
     true = lift_se2(np.column_stack([path, yaw]))
     pitch, roll = (tilt * lasting_noise(rng, stamps, seconds) for _ in range(2))
+    if hills:
+        phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, 2)
+        true[:, 2, 3], slope = _hills(path, phases)[0] * hills, _hills(path, phases)[1] * hills
+        pitch -= np.arctan((slope * np.column_stack([np.cos(yaw), np.sin(yaw)])).sum(axis=1))
+        roll += np.arctan((slope * np.column_stack([-np.sin(yaw), np.cos(yaw)])).sum(axis=1))
     true[:, :3, :3] = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll])).as_matrix()
     known, really = (make_camera(focal=FOCAL, position=(0.1, 0.0, 0.9), pitch=up) for up in (0.0, mount))
     place = np.column_stack([rng.uniform(-11, 11, 400), rng.uniform(-8, 8, 400), rng.uniform(0.3, 2.0, 400)])
@@ -52,13 +65,25 @@ def uneven_drive(
     steps = np.diff(np.column_stack([true[:, :2, 3], yaw]), axis=0) * (1 + 0.01 * rng.normal(size=(frames - 1, 1)))
     wheels = lift_se2(told[0] + np.vstack([np.zeros(3), np.cumsum(steps, axis=0)]))
     items = tuple(TruthObject(i, f"post {i}", place[i]) for i in range(posts))
+    stands = np.column_stack([place[:, :2], place[:, 2] + _hills(place[:, :2], phases)[0] * hills]) if hills else place
     return Log(
         "uneven",
-        (CameraLog(known, _boxes(rng, stamps, true, really, place)),),
+        (CameraLog(known, _boxes(rng, stamps, true, really, stands)),),
         Trajectory(stamps, inverse(wheels[0]) @ wheels),
         localization=Trajectory(stamps, lift_se2(told)),
         truth=Truth(items, Trajectory(stamps, true)),
     )
+
+
+_WAVES = 18.0, 25.0
+"""The lengths (m) of the waves of hilly ground along x and y. Longer waves are less curved, and tilt the robot less."""
+
+
+def _hills(place: Floats, phases: Floats) -> tuple[Floats, Floats]:
+    """Return the height (n,) of hilly ground with the standard deviation 1, and its slope (n, 2), at places (n, 2), m."""
+    waves = 2 * np.pi / np.array(_WAVES)
+    at = place * waves + phases
+    return np.sin(at).sum(axis=1), np.cos(at) * waves
 
 
 def shelf_drive(seed: int = 0) -> Log:

@@ -16,7 +16,7 @@ from objslam.core.geometry import is_planar
 from objslam.core.ground.flattening import flattened_lines, flattened_points, raised_points
 from objslam.core.ground.rise import rise_of
 from objslam.core.rotation import cross
-from objslam.core.types import Log
+from objslam.core.types import Keyframes, Log
 from objslam.frontend.up import upright
 from objslam.graph.fixed_pose_triangulation import flat_noise, noise_of_poses, noise_up
 from objslam.graph.robust_cost import ray_information
@@ -72,34 +72,48 @@ def with_lasting_errors(
     """
     if not solution.keyframes.localized_every:
         return solution, None
-    seen = _cells_of(solution, settings)
+    seen = cells_of(solution, settings)
     if not seen:
         return solution, None
-    from objslam.graph.posterior.marginals import largest_sigma  # Here, so that `load_libraries` comes first.
-
     added = np.zeros(solution.estimate.covariance.shape)
     found = [lasting_variances(cells) for cells in seen]
     if with_bodies is not None and max(one.sum() for one in found) > _SMALL**2:
         solution = with_bodies(solution)
-        seen = _cells_of(as_centres(solution), settings)
+        seen = cells_of(as_centres(solution), settings)
         found = [lasting_variances(cells) for cells in seen]
     for cells, variances in zip(seen, found, strict=True):
         objects, more = cells.covariances(variances)
         added[objects] += more
-    if (tilt := noise_up(solution.keyframes, settings)[0]) > 0:  # The variances of the last cells are those of the ground.
-        at, rolls = solution.keyframes, tilt * np.sqrt(found[-1][0])
-        added[:, 2, 2] += rise_of(at.stamps, at.map_T_base, rolls, np.array(TIMES)) ** 2
+    if noise_up(solution.keyframes, settings)[0] > 0:  # The variances of the last cells are those of the ground.
+        added[:, 2, 2] += rise_of_ground(solution.keyframes, found[-1], settings) ** 2
+    solution = with_covariances(solution, added)
+    if not is_planar(solution.keyframes.map_T_base):  # A camera in the hand keeps its view, so errors of boxes last as well.
+        return solution, None
+    noise = LastingNoise.of(seen[0], found[0], *noise_of_poses(solution.keyframes, settings))
+    return solution, noise
+
+
+def rise_of_ground(keyframes: Keyframes, variances: Floats, settings: Settings) -> float:
+    """Return the standard deviation (m) of the height of uneven ground whose tilts last (`rise_of`).
+
+    variances: (2, T) of the misses up and down, as in `lasting_variances`.
+    """
+    tilts = noise_up(keyframes, settings)[0] * np.sqrt(variances[0])
+    return rise_of(keyframes.stamps, keyframes.map_T_base, tilts, np.array(TIMES))
+
+
+def with_covariances(solution: Solution, added: Floats) -> Solution:
+    """Return the solution with larger covariances of its objects and their bodies. added: (N, 3, 3) m^2."""
+    from objslam.graph.posterior.marginals import largest_sigma  # Here, so that `load_libraries` comes first.
+
     wider = solution.estimate.with_errors(added)
     wider = replace(wider, seen_sigma=largest_sigma(wider.covariance))
-    if solution.bodies is not None:
-        bodies = (
-            None if body is None else body.with_errors(more) for body, more in zip(solution.bodies, added, strict=True)
-        )
-        solution = replace(solution, bodies=tuple(bodies))
-    if not is_planar(solution.keyframes.map_T_base):  # A camera in the hand keeps its view, so errors of boxes last as well.
-        return replace(solution, estimate=wider), None
-    noise = LastingNoise.of(seen[0], found[0], *noise_of_poses(solution.keyframes, settings))
-    return replace(solution, estimate=wider), noise
+    if solution.bodies is None:
+        return replace(solution, estimate=wider)
+    each = zip(solution.bodies, added, strict=True)
+    return replace(
+        solution, estimate=wider, bodies=tuple(None if body is None else body.with_errors(more) for body, more in each)
+    )
 
 
 def check_lasting_noise(noise: LastingNoise, settings: Settings, log: Log) -> Finding | None:
@@ -124,9 +138,9 @@ def check_lasting_noise(noise: LastingNoise, settings: Settings, log: Log) -> Fi
     )
 
 
-def _cells_of(solution: Solution, settings: Settings) -> list[Cells]:
-    """Return the cells of all objects with a covariance. For planar poses on uneven ground, the list has a second item, with
-    the misses up and down. Rejected rays and ranges do not count."""
+def cells_of(solution: Solution, settings: Settings) -> list[Cells]:
+    """Return the cells of all objects with a covariance, at the poses of the keyframes. For planar poses on uneven ground,
+    the list has a second item, with the misses up and down. Rejected rays and ranges do not count."""
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     placed = np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(estimate.positions[:, 0])
     which = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))

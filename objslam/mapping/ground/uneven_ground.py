@@ -1,13 +1,10 @@
 """Find uneven ground below planar poses before the objects are known, and allow for it."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import is_planar
-from objslam.core.ground.rise import rise_of
 from objslam.core.types import Log
 from objslam.frontend.known_errors import coarse
 from objslam.mapping.checks.agreement import Agreement, Part, agreement, bounded_part
@@ -55,10 +52,6 @@ def with_uneven_ground(log: Log, settings: Settings, ledger: Ledger, progress: P
     found = uneven_ground(log, settings)
     if found is None:
         return settings
-    if settings.mode == "joint" and log.localization is not None:  # In fixed mode, the lasting errors contain the rise.
-        path = log.localization
-        rise = rise_of(path.stamps, path.poses, np.array([found.tilt]), np.array([found.seconds]))
-        found = replace(found, height=float(np.hypot(found.height, rise)))
     with_ground = _with(settings, found)
     tilt, z = (float(f"{value:.2g}") for value in (np.degrees(with_ground.planar.tilt), with_ground.planar.z))
     ledger.warn(

@@ -20,6 +20,7 @@ from objslam.mapping.fixed.far_sides import with_far_sides
 from objslam.mapping.fixed.lasting_errors import check_lasting_noise, with_lasting_errors
 from objslam.mapping.fixed.lasting_noise import LastingNoise
 from objslam.mapping.fixed.map_at_poses import MapAtPoses
+from objslam.mapping.ground.heights import with_unknown_heights
 from objslam.mapping.ground.level_path import has_free_tilt, levelled
 from objslam.mapping.joint.path_against_localization import check_bent_path
 from objslam.mapping.moves.near_sides import check_rows
@@ -79,7 +80,9 @@ def _completed(found: SolvedDrive, *, level: bool) -> tuple[SolvedDrive, Lasting
         solution = levelled(solution)
     if drive.diagnosis.jumps is not None:
         solution = with_jumps(solution, drive.diagnosis.jumps)
-    if not drive.joint:
+    if drive.joint:
+        solution = with_unknown_heights(solution, settings)
+    else:
         solution, lasting = with_lasting_errors(solution, settings, lambda known: with_bodies(known, cameras, settings))
     if solution.bodies is None:
         solution = with_bodies(solution, cameras, settings)
