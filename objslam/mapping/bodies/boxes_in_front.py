@@ -1,6 +1,6 @@
 """Find edges of boxes that may belong to a thing in front, from the other boxes of the image and from the map. The body
 behind may reach beyond such an edge. A box of a thing without a place in the map counts as in front, because its distance is
-unknown. So does a box that the edge of the image cuts off."""
+unknown. A box that the edge of the image cuts off also counts as in front."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from objslam.mapping.bodies.cut_boxes import clipped, keyframe_of
 from objslam.mapping.solution import Solution
 
 _FARTHER = 0.25
-"""The margin by which the centre of a thing in front of another may be farther, as a share of the sum of their apparent half
-axes. One end of a long thing may be behind a thing whose centre is farther. With 0 instead, a chair before the end of a desk
-was not in front from most sides. If two things only touch in the image, each edge there is a bound for both. Other sides,
-from which they do not touch, show their ends. With a larger share, more things are in front."""
+"""A thing still counts as in front of another if its centre is farther by at most this share of the sum of their apparent
+half axes. One end of a long desk can lie behind a chair whose centre is farther than the centre of the desk. With a share of
+0, such a chair was not in front from most sides. If two things only touch in the image, the edges there are bounds for both
+things. Views in which the things do not touch show their ends. With a larger share, more things are in front."""
 _COVERED = 0.5
 """An edge is hidden if boxes in front cover more than this share of it. In simulated drives, 0.5 finds 98 % of the edges
 that are hidden by 12 px. A share of 0.1 finds the same 98 %, and 50 % more edges that are not hidden. With a larger share,

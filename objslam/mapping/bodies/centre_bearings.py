@@ -55,7 +55,7 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
     shift = with_bodies(Solution(keyframes, rays, association, estimate, ()), state.cameras, state.settings).to_centre
     if shift is None:
         return estimate, None
-    # The box of a rejected ray shows another thing. The shift would turn the ray to this body, and the ray would then agree.
+    # A rejected ray shows another thing. A shift would turn the ray to this body, and the ray would then wrongly agree.
     shift = shift.only(estimate.weight > 0)
     worth = worth_turning(shift, rays.sigma, association) | worth_lengthening(shift, rays, association)
     if not worth.any():

@@ -1,9 +1,9 @@
 """The bodies of boxes that the image's edge cuts off.
 
-Such a box says less than a whole one. At a cut off edge, the body reaches at least as far as the box, and maybe farther.
-This is also true of an edge that the body may touch outside the image. So these edges are only bounds. The body touches the
-other edges. Detectors often end a cut off box before the image's edge. So each bound is at the edge of the box, not at the
-edge of the image.
+Such a box says less than a whole one. At a cut off edge, the body reaches at least as far as the box, and maybe farther. The
+same is true of an edge that the body may touch outside the image. So both kinds of edges are only bounds. The body touches
+all other edges. Detectors often end a cut off box before the image's edge. So each bound is at the edge of the box, not at
+the edge of the image.
 """
 
 from __future__ import annotations

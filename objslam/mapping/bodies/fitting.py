@@ -28,13 +28,12 @@ from objslam.triangulation.bodies.solve import Bodies, solve_bodies
 FEWEST = 5
 """The fewest boxes of an object that gets a body. With a larger number, more objects stay points."""
 _CLEAR = 1.0
-"""The angle between the centre of a body and the centre of its box, above which the position is the centre of the body. It
-is in standard deviations of the boxes' shared error. The angle is 4 for a cabinet from close by. It is below 0.6 for things
-on a table that a noisy detector sees. With a larger value, more objects stay where their rays meet."""
+"""An object gets the centre of its body as its position if the angle between this centre and the centre of the box is above
+this limit. The unit is the standard deviation of the boxes' shared error. The angle is 4 for a cabinet from close by. It is
+below 0.6 for things on a table that a noisy detector sees. With a larger value, more objects stay where their rays meet."""
 _HIDDEN = 0.1
-"""The share of partly hidden boxes among all boxes of an object, above which the position is the centre of the body. The
-rays of partly hidden boxes miss the object, all to one side. With a larger share, more objects stay where their rays
-meet."""
+"""An object gets the centre of its body as its position if more than this share of its boxes are partly hidden. The rays of
+partly hidden boxes miss the object, all to one side. With a larger share, more objects stay where their rays meet."""
 _UNLIKE = 0.02
 """The least error of a body's centre that repeats from all sides, as a share of half the size of the body. No thing has
 exactly the shape of its body. The centres of simulated pots, cones, seats, monitors and people were off by 1 to 4 % of half
@@ -131,8 +130,8 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
     points = estimate.positions[association.object[ray]]
     # A point that its rays do not determine may lie at the camera. Such a point has no direction.
     apart = np.linalg.norm(points - origin, axis=1) > MIN_DEPTH
-    # The rejected box of a large thing may still show it, because its ray points beside the point where the others meet. If
-    # that point is not even near the box, the box shows another thing.
+    # The box of a rejected ray may still show a large thing: its ray points beside the point where the other rays meet. If
+    # this point is not even near the box, the box shows another thing.
     reach = np.linalg.norm(size_per_metre(rays.take(ray), keyframes, cameras), axis=1) / 2
     near = np.tan(np.minimum(angles_off(origin, direction, points), np.pi / 4)) < np.minimum(reach, 1.0)
     ray = ray[apart & ((estimate.weight[ray] > 0) | near)]

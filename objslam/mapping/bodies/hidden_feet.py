@@ -1,8 +1,8 @@
 """Find objects whose foot was never seen, by a comparison with the other objects of their label.
 
-A lamp post behind parked cars shows only its upper half, and no box of the cars says so if a detector missed them. Its body
-then ends where the post comes into view. The other posts end at the same height, and stand on the ground. In a classroom,
-most chairs are such things: desks hide all but their backs.
+A lamp post behind parked cars shows only its upper half. If the detector missed the cars, no box shows that they hide the
+lower half. The body of the post then ends where the post comes into view. The other posts end at the same height, and stand
+on the ground. In a classroom, most chairs have hidden feet: desks hide all but their backs.
 """
 
 from __future__ import annotations
@@ -73,6 +73,6 @@ def _missing(height: Floats, sigma: Floats, foot: Floats) -> Floats:
     raised = foot - low
     short = np.maximum(usual - low - height, raised)
     hidden = raised > max(_SIGMAS * spread / NORMAL_MEDIAN, _LEAST * (usual - low))
-    # A height that is unsure because its foot may be hidden is no reason against a hidden foot.
+    # A possibly hidden foot makes the height unsure. Such a height is no reason against a hidden foot.
     hidden &= (np.abs(top - usual) < raised / 2) & (short > sigma)
     return np.where(hidden, short, 0.0)

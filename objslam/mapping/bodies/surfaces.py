@@ -27,9 +27,9 @@ share of half the width. Such a body has only its prior. In simulated drives pas
 0.6. With a larger number, bodies that were seen from few sides count more."""
 _OF_SURFACES = 0.4
 """The least share of the distance to the surface from which ranges count as ending on surfaces. Ranges may end at the centre
-of a body (share 0) or on its surface (share 1). The share comes from a solve without bodies. In simulated drives, it was
-0.47 to 1.0 with depths of surfaces, and 0 to 0.31 with depths of centres. It is about `depth.centre` if a log does not show
-it. With a larger value, bodies correct the ranges of fewer logs."""
+of a body (share 0) or on its surface (share 1). A solve without bodies estimates this share. In simulated drives, the share
+was 0.47 to 1.0 with depths of surfaces, and 0 to 0.31 with depths of centres. If a log does not show the share, it is about
+`depth.centre`. With a larger value, bodies correct the ranges of fewer logs."""
 
 
 def range_shift(found: Bodies, views: BoxViews, ray: Ints, count: int, settings: Settings, common: float) -> RangeShift:
@@ -57,7 +57,7 @@ def range_shift(found: Bodies, views: BoxViews, ray: Ints, count: int, settings:
     weight = 1 / (1 + prior / variance)  # The weight of the share that all things have in common.
     use = np.isfinite(weight)[edges.body] & (wide > 0) & np.isfinite(rays.range)
     weight, before = weight[edges.body], shares_of(rays, settings)
-    # A thing is as far behind its surface as its body in this direction, where that is known.
+    # The centre of a thing is as far behind its surface as the centre of its body in this direction, where known.
     of_body = np.where(told, behind / np.maximum(wide, 1e-9), share[edges.body])
     after = weight * settings.depth.centre + (1 - weight) * of_body
     factor = to_centres(half, after) / to_centres(half, before)

@@ -150,8 +150,8 @@ def _diagnosed(log: Log, settings: Settings, ledger: Ledger, progress: Progress,
         doubted = bool(trials) and not part.drifts and not any(one.spoils for one in findings)
         doubted &= len(found.rays) >= _FEWEST
         none_fits = doubted and disagree(without_usual_errors(part, found, settings)[0], trials, part, settings)
-        # If none fits, boxes agree only by chance. They then say nothing about single frames, about halves, or about how a
-        # camera is turned.
+        # If no hypothesis fits, the boxes agree only by chance. They then say nothing about single frames, about halves, or
+        # about the rotation of a camera.
         findings += [none_fits] if none_fits else _parts_differ(part, found, settings)
         lens = None if none_fits else check_lens(part, found, settings)
         if lens is not None:

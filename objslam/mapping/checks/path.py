@@ -52,8 +52,9 @@ larger value suits noisy poses."""
 _PIECE = 1.0
 """The time (s) between two stamps at which distances are compared. A longer time is faster and less exact."""
 _PIECES = (1, 4, 16)
-"""The numbers of `_PIECE` over which distances are compared. A wrong scale shows over all of them. Noise of the places, as
-of satellite positioning, makes only short distances longer. Larger numbers suit noisier places and longer logs."""
+"""Distances are compared over these numbers of pieces (`_PIECE`). A wrong scale shows over each number. Noise of positions,
+such as that of satellite positioning, lengthens only short distances. Larger numbers suit noisier positions and longer
+logs."""
 _LEAST_PIECE = 0.3
 """Two distances are compared if both are at least this share of the longest distance in the same time. Shorter distances are
 noise. A larger share compares fewer distances."""
@@ -282,7 +283,7 @@ def straightness(path: Trajectory) -> float | None:
     first, last, direction = first[kept], last[kept], way[kept] / length[kept, None]
     if np.linalg.norm(direction.mean(axis=0)) > 0.9:
         return None
-    # The base between the two poses has, to first order, the mean axes of both.
+    # To first order, the axes of base between two poses are the mean of the axes at both poses.
     middle = path.poses[first, :3, :3] + path.poses[last, :3, :3]
     in_base = np.einsum("nji,nj->ni", middle, direction)
     size = np.linalg.norm(in_base, axis=1, keepdims=True)

@@ -6,8 +6,8 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import binomial_tail
 
 LEAST_LOG_ODDS = np.log(1e3)
-"""The least log odds that a group is not there by chance. They allow for the number of tried places. At this value, one log
-in a thousand shows a group by chance. A larger value finds fewer groups."""
+"""The least log odds that a group is not there by chance. The odds already allow for the number of tried places. At this
+value, one log in a thousand shows a group by chance. A larger value finds fewer groups."""
 
 
 def crowded(inside: Ints, around: Ints, share: float, tried: int) -> Floats:

@@ -50,9 +50,9 @@ def crossing(result: RunResult, evidence: Evidence) -> list[Doubt]:
     """Return a doubt for each object that is probably not one thing at its place, the most probable first.
 
     The rays of such an object come from two sides. Two things whose rays cross at the object explain the rays too. The
-    association divides such an object only if it is clearly two, because a thing that is divided may be lost. The
-    association also allows for more noise than the solved poses have. Frames that should show the object, but do not, make
-    it less probable that the object is one thing (`existence`).
+    association splits such an object only if it is clearly two things, because a split may lose a thing. The association
+    also allows for more noise than the solved poses have. Frames that should show the object, but do not, make it less
+    probable that the object is one thing (`existence`).
     """
     state = evidence.state
     sized = np.array([camera.sees_size for camera in result.cameras], dtype=bool)

@@ -27,7 +27,7 @@ from objslam.mapping.moves import other_places as moved
 from objslam.mapping.moves import temporary_things as temporary
 
 _DOUBLE = 0.5
-"""The least probability of being one object for a pair of objects that counts in the assessment. With a larger value, more
+"""A pair of objects counts in the assessment if it is one object with at least this probability. With a larger value, more
 maps are good."""
 _DOUBTFUL = 0.4
 """The least share of doubtful objects in a bad map. A doubtful object is likely a double, or may be several things or at a
@@ -39,24 +39,25 @@ _FEWEST_DOUBTFUL = 8
 _DOUBLES = 0.2
 """The least share of objects that are likely doubles, or that some visits do not show, in a map whose poses are likely
 wrong. Two streets had 0.33 and 0.41 at places of a GPS that wanders by half a metre. After a solve of the poses, a street
-with 20 cars that parked for a time had 0.13. An orchard had 0.02. With a larger share, fewer poses are solved too."""
+with 20 cars that parked for a time had 0.13. An orchard had 0.02. With a larger share, fewer logs get a solve of the
+poses."""
 _LOST = (0.1, 0.5)
 """The shares of boxes from which a group that became no object counts in the assessment. The group counts if it has at least
 the first share of all boxes of its label. It also counts if it has at least the second share of the median number of boxes
 of an object of its label. False boxes of a detector at one place are usually fewer. With larger shares, more maps are
 good."""
 _MARKED = 1 / 20
-"""The largest share of doubtful things in a map at a localisation that leaves its level as it is. It is the share of the
-objects for doubts about single objects, and the share of the things for lost things. `doubts.json` and the report mark them.
-Each object is tested by itself, so a large right map often has a doubtful object. In simulated homes, doubts name about half
-of the objects that are false or over 3 sigma off. So in a map with a tenth of such objects, about this share is doubted.
-With a larger share, more maps are good."""
+"""At a localisation, the level of a map does not change up to this share of doubtful things. Doubtful objects are a share of
+all objects, and lost things are a share of all things. `doubts.json` and the report still mark them. Each object is tested
+by itself, so a large right map often has a doubtful object. In simulated homes, doubts name about half of the objects that
+are false or over 3 sigma off. So in a map with a tenth of such objects, about this share is doubted. With a larger share,
+more maps are good."""
 _FEWEST_LOST = 5
 """The fewest boxes of a group that counts in the assessment. With a larger number, more maps are good."""
 _AT_REST = 0.5
-"""The least share of a label's boxes in its lost things, for a label without a placed object. With a smaller share, the lost
-things do not count in the assessment: most boxes then fit no place, as those of another robot that sometimes stops. The
-assessment names such a label in any case. With a larger share, more maps are good."""
+"""If a label has no placed object, its lost things count in the assessment only if they have at least this share of the
+label's boxes. Below this share, most boxes fit no place, as the boxes of another robot that sometimes stops. The assessment
+names such a label in any case. With a larger share, more maps are good."""
 _VIEWS = (3, np.radians(10.0))
 """The fewest views of a lost thing that counts although few of the frames show it, and the least angle (rad) between two
 views. A detector repeats a false box while it sees a place from one view. Two false views cross somewhere, so the third view
@@ -193,8 +194,8 @@ def _of_doubtful(doubtful: int, result: RunResult) -> str:
 def _are_few(odd: int, lost: int, result: RunResult) -> bool:
     """Return whether the doubts about `odd` objects and `lost` things are too few to change the level of the map.
 
-    From odometry alone, they are never too few: a false object bends the path, which moves all other objects. At a
-    localisation, a false object moves no other.
+    From odometry alone, the doubts are never too few: a false object bends the path, which moves all other objects. At a
+    localisation, a false object moves no other object.
     """
     known = len(result.map.resolved())
     localized = bool(result.keyframes.localized_every)

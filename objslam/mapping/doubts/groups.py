@@ -46,8 +46,8 @@ _RANGE_SIGMAS = 3.0
 """The median deviation of ranges from the place above which the ranges disagree, in standard deviations. With a larger
 number, fewer groups have this reason."""
 _FITTED = 6
-"""The number of parameters of a moving point: its place and its velocity. The point explains this number of measured
-coordinates in any case. Each ray has two. With a larger number, fewer groups of few rays are said to move."""
+"""The number of parameters of a moving point: its place and its velocity. Such a point always explains this number of
+measured coordinates. Each ray has two coordinates. With a larger number, fewer groups of few rays are said to move."""
 _MOVES = np.log(20.0)
 """The least log odds of motion against rest for a group that is said to move. Boxes of a thing at rest, seen under little
 parallax, reach 2.5 if they share an error. With larger odds, fewer groups are said to move."""

@@ -17,8 +17,8 @@ _WIDE = 30.0
 """The angle (deg) between rays from which more views hardly make the point of an object surer. A wide sigma then comes from
 the poses or from the body. With a larger angle, more people are told to drive around the object."""
 _BY_BODY = 0.7
-"""The share of a sigma from which the sigma counts as coming from the body. It is compared with half the sigma of the body's
-size in the same direction. With a larger share, fewer people are told to look at another side of the object."""
+"""A wide sigma comes from the body if half the sigma of the body's size in the same direction is at least this share of the
+wide sigma. With a larger share, fewer people are told to look at another side of the object."""
 _MOST = 0.5
 """A map is good only if at most this share of its objects with a position is unsure. With a larger share, more maps are
 good."""
@@ -28,8 +28,8 @@ def unsure_objects(result: RunResult) -> list[Doubt]:
     """Return a doubt for each object with a position whose sigma exceeds `triangulation.sure_sigma`, the least sure first.
 
     The error that all objects share does not count, because it moves the whole map together with a robot in it. In the frame
-    of the odometry, a scale of the odometry that the log does not show does the same. If the path bends with the scale, the
-    covariance of the shared error contains only a part of the scale.
+    of the odometry, an unknown scale of the odometry also moves the whole map together with the robot. If the path bends
+    with the scale, the covariance of the shared error contains only a part of the scale.
     """
     known = [o for o in result.map if o.covariance is not None and o.status == "ok"]
     if not known:

@@ -20,8 +20,8 @@ _SURE = 1000
 """The largest odds that are said as a number. Larger odds are said to be more than this, because the model of the boxes is
 not exact enough. With a larger number, more odds are said exactly."""
 _DISAGREE = 2.0
-"""The least distance (root mean square) of rays from an object with which they disagree, as a multiple of their noise. With
-a larger number, fewer objects are said to have rays that disagree."""
+"""Rays disagree with an object if their root mean square distance from it is at least this multiple of their noise. With a
+larger number, fewer objects are said to have rays that disagree."""
 _SPAN = (0.1, 0.9)
 """The quantiles of the stamps of an object's boxes between which the object was seen. They leave out single boxes of other
 things. A wider span finds fewer pairs whose boxes follow one another in time."""
@@ -72,7 +72,7 @@ def _noise_deg(result: RunResult, j: int) -> float:
 def _pairs(result: RunResult, pairs: Pairs) -> Iterator[Doubt]:
     for i, (j, k) in enumerate(zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)):
         a, b = result.map.objects[j], result.map.objects[k]
-        # The centres of bodies can be nearer than the points where the rays meet, which the test compares.
+        # The test compares the points where rays meet. The centres of bodies can be nearer to each other.
         apart, expected = float(np.linalg.norm(a.position - b.position)), float(pairs.expected[i])
         if expected < 1:
             frames = "no frame should show both"

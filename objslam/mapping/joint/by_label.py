@@ -201,8 +201,8 @@ def _path_of(state: JointState, some: Association) -> Floats | None:
     all keyframes show objects, or if there is a localisation.
 
     A solve without a localisation begins with a graph that grows by some keyframes at a time. Keyframes that show only a
-    thing that moves would count too. They may lead the graph to a wrong minimum. A solve without these keyframes does not
-    end there. state: before the first solve.
+    moving thing may lead this graph to a wrong minimum. A solve without these keyframes does not end at this minimum. state:
+    before the first solve.
     """
     shown = some.object >= 0
     if state.keyframes.localized_every or len(np.unique(state.rays.keyframe[shown])) == len(state.keyframes):

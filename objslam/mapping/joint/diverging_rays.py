@@ -14,17 +14,18 @@ _SOON = 3.0
 """The longest time (s) between two rays that are compared. In a longer time, the odometry may err by too much. In a shorter
 time, the robot sees fewer things of a label."""
 _APART = np.radians(20.0)
-"""The angle (rad) by which one ray must at least turn to meet another, so that the two diverge. Errors of clock, camera and
+"""Two rays diverge if one of them must turn by at least this angle (rad) to meet the other. Errors of clock, camera and
 odometry turn rays too. Six recorded drives with names were tested with clocks off by up to 1 s, or turns off by 20 %. At
 most one pair of a drive exceeded this angle, and up to 4 pairs exceeded 15 degrees. With a larger angle, fewer labels of
 several things are found."""
 _MANY, _SHARE = 5, 0.1
-"""The least number and the share of a label's pairs that must diverge, so that the label diverges. In six recorded drives,
-15 to 17 things were given five labels. These had 44 to 712 such pairs. With larger values, fewer labels are found."""
+"""A label diverges if at least this number and this share of its pairs diverge. In a test with six recorded drives, the 15
+to 17 things of a drive got only five labels. These labels had 44 to 712 diverging pairs. With larger values, fewer labels
+are found."""
 _MOST = 0.5
-"""The least share of diverging labels among the labels with `_MANY` rays, so that labels are no names. They must also have
-at least this share of the rays. Rays to things that move diverge too, but seldom for half of the labels. With a larger
-share, more maps of names are tried. Each takes a solve of up to a minute."""
+"""Labels are no names if at least this share of the labels with `_MANY` rays diverge. The diverging labels must also have at
+least this share of the rays. Rays to things that move diverge too, but seldom for half of the labels. With a larger share,
+more maps of names are tried. Each takes a solve of up to a minute."""
 
 
 def labels_diverge(keyframes: Keyframes, rays: Rays) -> bool:

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from objslam.mapping.solution import Solution
 
 _WITNESSES = 2
-"""The least number of other labels that must be seen before and after a moment, to check a label at this moment. The places
-of two objects fix a motion on the floor, so the path cannot bend at this moment. With fewer objects, a bend can bring two
+"""To check a label at a moment, at least this number of other labels must be seen before and after the moment. The places of
+two objects fix a motion on the floor, so the path cannot bend at this moment. With fewer objects, a bend can bring two
 things to one place. With a larger number, labels of more logs are doubted. MRCLAM and Lost in the Woods have 2 and more
 everywhere."""
 _GREW = 1.2
@@ -33,19 +33,18 @@ _GREW = 1.2
 with a turn on the spot and two things of one label, the factor was 1.5 to 6, and mostly 4. With one thing for each label and
 the odometry of the settings, it was at most 1.1. With a larger factor, fewer labels are doubted."""
 _MISSED, _TAIL = 1.5, 0.9
-"""`_MISSED` is the multiple of their nominal noise by which single boxes must miss in a solve with noisy odometry, so that
-all labels are doubted. If several labels have two objects each, they cannot check one another, but their boxes miss. `_TAIL`
-is the quantile of the misses that is compared, because a bent path lets some boxes fit well. With one thing for each label,
-simulated rigs of three cameras miss by 0.7 to 0.9. Six drives with two labels of two things miss by 1.9 to 4.7. With a
-larger `_MISSED`, fewer labels are doubted. With a smaller one, more logs are explored without need. With a larger `_TAIL`,
-wrong names are taken for noise."""
+"""In a solve with noisy odometry, all labels are doubted if single boxes miss by at least `_MISSED` times their nominal
+noise. If several labels have two objects each, they cannot check one another, but their boxes miss. `_TAIL` is the quantile
+of the misses that is compared, because a bent path lets some boxes fit well. With one thing for each label, simulated rigs
+of three cameras miss by 0.7 to 0.9. Six drives with two labels of two things miss by 1.9 to 4.7. With a larger `_MISSED`,
+fewer labels are doubted. With a smaller one, more logs are explored without need. With a larger `_TAIL`, wrong names are
+taken for noise."""
 _NOISY_BOXES = 2.0
 """The factor on the noise of boxes above which a map needs noisy boxes. The recorded wheel robots have 0.5 to 1.2 with one
 thing for each label. With a larger factor, more maps with one object for each label are trusted."""
 _REJECTED = 0.1
-"""The least share of a label's rays that must be rejected, so that the label is doubted. At least `MANY` rays must be
-rejected too. With a larger share, fewer labels are doubted. With a smaller share, wrong names and false boxes look like a
-second object."""
+"""A label is doubted if at least this share of its rays is rejected. At least `MANY` rays must be rejected too. With a
+larger share, fewer labels are doubted. With a smaller share, wrong names and false boxes look like a second object."""
 _NOISIER = 1.5
 """The largest noise of boxes or depths that a map with one object for each label may need, as a multiple of the noise that a
 map with several objects needs. A larger factor favours one object for each label."""

@@ -1,10 +1,10 @@
 """Find held errors that are so large that the map shows them. A held error is one that joint mode does not estimate.
 
 With odometry alone, the place and the focal length of a camera are held, because a path that is free to bend also fits their
-usual errors. The difference of two wheels is held too. A drive whose labels are no names hardly distinguishes it from the
-bias of a gyroscope. But a gross error bends the path so much that the objects move by many of their sigmas. So a gross error
-is estimated after all. A usual error of a focal length is not estimated, but the sigmas contain its effect. A camera that
-somebody turned during the drive cannot be corrected, because no box shows when somebody turned it."""
+usual errors. The difference of two wheels is held too. A drive whose labels are no names hardly distinguishes this
+difference from the bias of a gyroscope. But a gross error bends the path so much that the objects move by many of their
+sigmas. So a gross error is estimated after all. A usual error of a focal length is not estimated, but the sigmas contain its
+effect. A camera that somebody turned during the drive cannot be corrected, because no box shows when somebody turned it."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ _GROSS = 3.0
 bend to fit a small error that is not there. At 1.5, an image centre that was off by 20 px became a wrong place of the
 camera."""
 _SUSPECT = 0.6
-"""The share of a limit that a predicted error must exceed, so that a solve estimates the error. The limit is that of a gross
-error (`_GROSS`) or of a turned camera (`MOVED`). One step from a bent path predicts 65 to 90 % of an error. With a smaller
-share, more solves find nothing."""
+"""A solve estimates an error if its predicted value exceeds this share of a limit. The limit is that of a gross error
+(`_GROSS`) or of a turned camera (`MOVED`). One step from a bent path predicts 65 to 90 % of an error. With a smaller share,
+more solves find nothing."""
 _FEWEST = 60
 """The fewest boxes in each half of a drive that show whether a camera was turned. Fewer boxes agree by chance."""
 
@@ -74,10 +74,10 @@ def with_gross_errors(errors: SharedErrors, solved: Solved) -> tuple[SharedError
     """Return the shared errors with the gross held errors added, so that a solve estimates these too. Return None if none is
     gross.
 
-    Also return the estimate. If no held error is gross, the estimate has `moved_by_held`, unless this cannot be computed.
-    The settings of the returned errors have the prior of the new errors. Errors whose setting is not `auto` are not added.
-    Errors in calibration.file are not added either, because the log is already corrected by them. errors: the shared errors
-    of the solve, as measured.
+    Also return the estimate. If no held error is gross, the estimate has `moved_by_held`, unless `moved_by_held` cannot be
+    computed. The settings of the returned errors have the prior of the new errors. Errors whose setting is not `auto` are
+    not added. Errors in calibration.file are not added either, because the log is already corrected by them. errors: the
+    shared errors of the solve, as measured.
     """
     held, estimate = _held(errors), solved.estimate
     if not held or not _can_tell(errors):
@@ -89,7 +89,7 @@ def with_gross_errors(errors: SharedErrors, solved: Solved) -> tuple[SharedError
         return [name for name in held if name in kinds]
 
     wider = _freed(errors, held)
-    if wider.names == errors.names:  # The poses are those of the camera, which then has no errors.
+    if wider.names == errors.names:  # The poses are poses of the camera, so the camera has no errors of its own.
         return None, estimate
     try:
         step = _next_step(wider, solved)
@@ -130,7 +130,7 @@ def _moved_by_held(errors: SharedErrors, solved: Solved, step: NextStep | None =
         return None
     wider = _freed(errors, [_BENDS])
     held = np.array([name not in errors.names for name in wider.names])
-    if not held.any():  # A camera whose poses are those of the robot has no such errors.
+    if not held.any():  # If the poses are poses of the camera itself, no such errors exist.
         return None
     known = None if step is None else step.only(_like(wider, solved))
     return (_next_step(wider, solved) if known is None else known).moved_by(held)

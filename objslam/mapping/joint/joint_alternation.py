@@ -32,8 +32,8 @@ _FIRST = 2.0
 """The factor on `_SOLVED_XY` and `_SOLVED_YAW` before the first solve, and on a path from a grid. With a larger factor, an
 association tolerates larger residuals."""
 _RUINED = 200.0
-"""The least log odds of the best round over the last round at which the best round is taken instead. A right merge may first
-cost 80, and ruined maps cost 500 to 5000. With a larger value, a worse map may stay."""
+"""The best round replaces the last round if its log odds over the last round are at least this value. A right merge may at
+first cost 80, and ruined maps cost 500 to 5000. With a larger value, a worse map may stay."""
 Guess = tuple[Association, Floats]
 """An association of the rays, and the positions (N, 3) m of its objects."""
 
@@ -148,8 +148,8 @@ class JointState:
         """Return the state after association and solve in turns. map_T_base: (K, 4, 4) the first poses.
 
         If a round finds the association of an earlier round again, a few rays could change back and forth without end. Then
-        the best `explained` state since that round is returned. A few changed rays hardly change the shared errors, but to
-        estimate these takes most of the time of a solve. So the shared errors keep the values of the first round. After the
+        the best `explained` state since that round is returned. A few changed rays hardly change the shared errors, but
+        estimating the shared errors takes most of the time of a solve. So they keep the values of the first round. After the
         last round, they are estimated again.
         """
         state, before, earlier, states = self, self, dict[bytes, Self](), [] if self.estimate is None else [self]
@@ -185,7 +185,7 @@ class JointState:
     def _or_if_ruined(self, states: Sequence[Self]) -> Self:
         """Return this state, or the best of some earlier states if it explains the log far better (`_RUINED`).
 
-        In the last round, a wrong merge can ruin a map. So can noise that is estimated from half of the rays."""
+        In the last round, a map can be ruined by a wrong merge, or by noise that is estimated from half of the rays."""
         best = max(states, key=lambda one: one.explained, default=self)
         if best.association is None or best.explained - self.explained < _RUINED:
             return self

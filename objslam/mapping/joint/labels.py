@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from objslam.mapping.solution import Solution
 
 MANY, SECOND = 5, 0.25
-"""The least number and the share of a label's rays that must be rejected, so that the label has a second object. With larger
-values, fewer second objects are found."""
+"""A label has a second object if at least this number and this share of its rays are rejected. With larger values, fewer
+second objects are found."""
 _DOUBLE = 0.1
-"""The largest share of pairs of a label and a keyframe with several boxes, at which one object for each label is tried. A
-detector draws some boxes twice, and some false ones. With a larger share, more logs are tried without success. Each try
-takes a solve."""
+"""One object for each label is tried if at most this share of the pairs of a label and a keyframe have several boxes. A
+detector draws some boxes twice, and draws some false boxes. With a larger share, more logs are tried without success. Each
+try takes a solve."""
 _AGREES = 3.0
 """The largest miss, in standard deviations, of a ray that agrees with the object of its label. With a larger value, fewer
 boxes can show a second object."""

@@ -1,5 +1,5 @@
-"""Merge objects that are in the map twice, and split objects that may be two things. Drift between two visits causes
-both."""
+"""Merge objects that are in the map twice, and split objects that may be two things. Drift between two visits causes both
+errors."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ which takes time."""
 
 
 def merge_unseen_together(rays: Rays, association: Association, estimate: Estimate, farthest: float) -> Association:
-    """Return the association with pairs of objects merged that have one label, agree within their covariances, and share no
-    frame.
+    """Return the association with some pairs of objects merged. The two objects of a pair have one label, agree within their
+    covariances, and share no frame.
 
     Two copies of a thing each fit the drifted poses of their visit, so a new association at these poses keeps both. The
     merge closes the loop. The nearest pairs by Mahalanobis distance merge first. An object merges at most once in one call.
@@ -72,8 +72,8 @@ def joined(association: Association, into: Ints) -> Association:
 
 
 def split_at_gaps(direction: Floats, association: Association, used: Bools, fewest: int) -> Association:
-    """Return the association with objects split whose rays come in two bundles. A wide gap lies between the directions of
-    the bundles.
+    """Return the association with some objects split. The rays of a split object come in two bundles with a wide gap between
+    their directions.
 
     The bundles may be two things, such as the signs on both sides of a wall. If the path is bent to bring the two things
     together, all rays of both agree with one point.

@@ -29,7 +29,7 @@ number takes longer, but gets over more rounds in which close objects merge."""
 
 def relocalized(begin: JointState) -> JointState:
     """Return the state after rounds along the most likely path through the map, if this state is `better`. Otherwise return
-    the given state. It is also returned if the search has taken all its solves.
+    the given state. The given state is also returned if the search has taken all its solves.
 
     The rounds of `JointState.alternated` keep a path that is bent onto wrong landmarks, because all its rays agree. So each
     round here begins with another path. This is the most likely path if any ray may belong to any landmark. Every second

@@ -33,13 +33,13 @@ _PILE = 0.2
 chance. A larger share accuses more logs."""
 _TURNS, _CLOCKS = (-24.0, -12.0, 12.0, 24.0), (-1.0, -0.5, 0.5, 1.0)
 """The turns of all headings (degrees) and the offsets of the frames' clock (s) with which a log is compared. Each is too
-large to fit a right log. More of them make it rarer that wrong input fits best as it is given."""
+large to fit a right log. With more turns and offsets, wrong input more rarely fits best as it is given."""
 _PEAK = 0.8
 """The largest score with a turn or a clock offset of right input, as a share of the score of the log as it is given. Right
-logs have at most 0.75: one simulated drive in a hospital with many people, and two of cars with GPS, whose poses err by far
-more than the settings say. With turned cameras, wrong clocks, or the poses of another drive, they have at least 0.9. With
-mirrored paths, they have 0.62 to 0.91, so only a hypothesis with a higher score shows these. A larger share accuses fewer
-logs."""
+logs have at most 0.75. The largest values are from a simulated drive in a hospital with many people, and from two drives of
+cars with GPS, whose poses err by far more than the settings say. Logs with turned cameras, wrong clocks, or the poses of
+another drive have at least 0.9. Logs with mirrored paths have 0.62 to 0.91, so only a hypothesis with a higher score shows a
+mirrored path. A larger share accuses fewer logs."""
 _TRIED = 64  # The most directions that are tried for a distant thing. A larger number finds smaller piles.
 
 

@@ -37,20 +37,20 @@ _HALF = 0.5
 """The least share of fitting boxes of a hypothesis about a log with a localisation. A hypothesis with fewer fitting boxes
 fits by chance: the right hypothesis lets 0.9 of the boxes fit. A larger share names fewer causes."""
 _RIVAL = 0.02
-"""The largest loss of score of a mount that explains the boxes as well as an unusual error does. Two fits of one log with
-different random pairs differ by as much. A larger value names more mounts."""
+"""A mount explains the boxes as well as an unusual error if its score is lower by at most this value. Two fits of one log
+with different random pairs differ by as much. A larger value names more mounts."""
 
 _BOTH_WAYS = 0.8
-"""The ratio of the scores of an earlier and a later clock, worse to better, from which the clocks contradict each other. A
-camera has one clock error. In simulated logs with a wrong clock, no shift in the other direction has more than 0.61 of the
-best score. A smaller share names fewer clocks."""
+"""An earlier and a later clock contradict each other if the lower of their scores is at least this share of the higher one.
+A camera has only one clock error. In simulated logs with a wrong clock, no shift in the other direction has more than 0.61
+of the best score. A smaller share names fewer clocks."""
 _CHANCE = 90.0
-"""The percentage of all turned mounts that have at most the score of chance. With a larger percentage, more agreement counts
+"""The score by chance is this percentile of the scores of all turned mounts. With a larger percentile, more agreement counts
 as chance."""
 _LEFT, _TIMES_CHANCE = 0.62, 1.5
-"""The limits of two tests that compare a hypothesis with turned mounts, which fit by chance. They count at poses of a
-localisation. A hypothesis must pass one of the tests. Its misfit (1 - score) must be at most the share `_LEFT` of the misfit
-by chance, or its score at least `_TIMES_CHANCE` times the score by chance. Noisy poses spoil a true fit, but hardly a fit by
+"""The limits of two tests that compare a hypothesis with turned mounts, which fit by chance. The tests apply at poses of a
+localisation. A hypothesis must pass one of them. Its misfit (1 - score) must be at most the share `_LEFT` of the misfit by
+chance, or its score at least `_TIMES_CHANCE` times the score by chance. Noisy poses spoil a true fit, but hardly a fit by
 chance. So a wrong hypothesis may fit better than the unchanged log. In 80 logs of 16 simulated robots with a mistake, the
 right hypothesis leaves a share of at most 0.57. In noisy logs without a mistake, the best hypothesis leaves at least 0.68,
 and has at most 1.36 times the score. A larger share and a smaller multiple name more causes."""
@@ -201,7 +201,7 @@ def _of_another_drive(first: Trial, best: Trial) -> Finding:
 def chance(trials: Sequence[Trial]) -> float | None:
     """Return the score that boxes reach by chance in this log, None if no mounts were tried.
 
-    It is the score from which the best tenth of all turned mounts begins. At most one mount is right.
+    A tenth of all turned mounts have a higher score (`_CHANCE`). At most one mount is right.
     """
     turned = [trial.score for trial in trials if trial.hypothesis is not None and trial.hypothesis.of_mount]
     return float(np.percentile(turned, _CHANCE)) if turned else None
