@@ -7,9 +7,9 @@ from objslam.core.arrays import Bools, Floats, Ints
 
 _ONE_THING = 1 / 3
 """The least intersection over union of two boxes of one label and frame that may show one thing. Two boxes of equal size
-with this value cover half of each other. The suppression of detectors leaves second boxes below 0.45 to 0.7. Things side by
-side have 0. A thing behind another thing has a larger value from a few places only. With a larger value, second boxes become
-objects."""
+with this value cover half of each other. The non-maximum suppression of detectors leaves second boxes with values below 0.45
+to 0.7. Boxes of things side by side have 0. Boxes of a thing and of a thing behind it have a larger value from a few places
+only. With a larger value, second boxes become objects."""
 TOGETHER = 0.03
 """The largest share of the rarer object's frames that may show both objects if the two are one thing. With a larger share,
 different objects merge."""

@@ -22,8 +22,8 @@ _UNUSUAL_RATE = (0.6, 12.0)
 is its mean, as a share of the rate of the class: about a half, as for a thing that is hidden on one visit of two. The second
 number is its concentration. With a larger mean, misses drop more objects."""
 _SHARED_RAYS = 0.5
-"""The largest share of a landmark's rays that may also pass another landmark of the label, if the landmark may be detected
-more rarely than its class. With a larger share, fewer neighbours are dropped, and more phantoms stay."""
+"""A landmark may be detected more rarely than its class if at most this share of its rays also pass another landmark of the
+label. With a larger share, fewer neighbours are dropped, and more phantoms stay."""
 _SAME_VIEW = 0.25
 """The largest distance between two places of the camera from which a thing looks alike, as a share of the distance to the
 thing. This is a turn of 14 degrees. With a larger share, a wall or a shelf that hides the thing from one of the places is
@@ -33,9 +33,9 @@ _FROM_ELSEWHERE = 0.5
 every twelfth frame has most misses near its detections. With a larger share, fewer hidden objects are kept. No other
 share was tried."""
 _VISITS, _BOXES = 2, 3
-"""The fewest visits in which an object was detected that may be hidden from other places, and the fewest boxes of a visit
-that counts. Rays to a thing that moves meet by chance in one visit, and one or two of another visit pass there too. With
-larger numbers, fewer hidden objects are kept, and fewer things that move."""
+"""An object may be hidden from other places if it was detected in at least the first number of visits. A visit counts if it
+has at least the second number of boxes. Rays to a moving thing meet by chance in one visit, and one or two rays of another
+visit pass there too. With larger numbers, fewer hidden objects are kept, and fewer things that move."""
 _OFTEN = 0.75
 """The least detection rate of a class whose objects may be hidden from most places, as a share of the rate of all classes.
 Things that move are rarely detected where they were. In a simulated warehouse, fork-lifts had 0.6 and people 0.3. With a
@@ -50,11 +50,11 @@ _PHANTOM_LOG_RANGE = 4.6  # The width of the uniform ln size distribution of pha
 _MOST_ODDS = 20.0  # The largest absolute log odds against chance. This limit only keeps them finite.
 _REST_PRIOR = 3.0  # The prior log odds of a static object over a moving one. A larger value drops fewer objects.
 _WITHIN_SIZE = 0.5  # The share of an object's size that its apparent motion may have, because box centres wander that far.
-_DRIFTED = 2.0  # An object may seem to move by this number of standard deviations of the path's drift. More drop fewer.
+_DRIFTED = 2.0  # The largest apparent motion of an object, in sigmas of the path's drift. A larger value drops fewer.
 _WITHIN_NOISE = 8.0
 """The largest apparent motion of a thing at rest, in standard deviations of a ray. Poses that err for seconds cause it. In
-simulations with errors of 2 s, things at rest seemed to move by up to 8, and people who walk by 30. With a larger number,
-more things that move become objects."""
+simulations with pose errors that last 2 s, things at rest seemed to move by up to 8, and walking people by 30. With a larger
+number, more things that move become objects."""
 _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test.
 
 
@@ -168,8 +168,8 @@ def rate_odds(state: State, gate: float) -> Floats:
     """Return the log odds (N,) of an object over a phantom, from the numbers of boxes, the detections and the misses.
 
     Walls, shelves and table tops have no boxes, but they hide an object from most places. So an object that may be detected
-    more rarely than its class (`rarer_objects`) may also be one that is hidden from some places. Then only the frames count
-    that look from places near those from where it was detected. gate: see `rarer_objects`.
+    more rarely than its class (`rarer_objects`) may also be hidden from some places. Then only frames from places near the
+    places of its detections count. gate: see `rarer_objects`.
     """
     rates, prior = rates_of_classes(state), prior_odds(state)
     rarer = rarer_objects(state, rates, gate)
@@ -211,9 +211,9 @@ def _hidden_elsewhere(state: State, landmarks: Ints) -> tuple[Ints, DetectionHis
 
 
 def looks_alike(places: Floats, detected: Bools, thing: Floats) -> Bools:
-    """Return from which places (n, 2) m of the camera a thing at a place (2,) m looks about as it did in its detections.
+    """Return from which camera places (n, 2) m a thing at a place (2,) m looks about as it did in its detections.
 
-    detected: (n,) from which places it was detected, at least from one.
+    detected: (n,) from which camera places the thing was detected, at least one.
     """
     from scipy.spatial import cKDTree  # It takes long to load, and few logs need it.
 

@@ -18,24 +18,24 @@ _ALTERNATIONS = 3  # The most alternations after a change. A larger value conver
 _FAR = 1e6
 """The distance (m) from the first camera beyond which only parallel rays meet. A larger distance keeps farther landmarks."""
 _SETTLED = 1e-9
-"""The largest change of a position (m) and of a noise factor that counts as no change in a refinement. A larger value leaves
-positions that the solver would still move. The positions of settled landmarks move by 1e-15 m."""
+"""Changes of a position (m) and of a noise factor up to this value count as no change in a refinement. With a larger value,
+the refinement ends before positions have settled. The positions of settled landmarks move by 1e-15 m."""
 _PAIRS_AT_ONCE = 1 << 15  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
 _TABLE = 1 << 12
 """The most entries of a dense table of gains. Up to about this size, as in the frames of a live session, a dense table is
 faster than a sparse one. A larger table of many parts is mostly empty, and its time grows with the cube of its rows."""
 _TOGETHER = 1 << 10
-"""The number of edges that one call of the Hungarian method gets, about. A call gets several parts of frames. Each call has
-a fixed cost. With a larger number, there are fewer calls. Each takes longer, because the method visits all rays for each
-ray."""
+"""The approximate number of edges that one call of the Hungarian method gets. A call gets several parts of frames, and has a
+fixed cost. With a larger number, there are fewer calls, but each call takes longer, because the method visits all rays for
+each ray."""
 
 
 @dataclass(frozen=True)
 class Edges:
     """Possible matches (E,), sorted by ray, then by landmark. deviation: squared deviation of the bearing, in variances (2
-    degrees of freedom). vague: 2 ln of a ratio of two areas in the image. They are the area where the landmark may appear,
-    and the area of the ray's own noise. cost: deviation + vague + the cost of the range."""
+    degrees of freedom). vague: 2 ln of a ratio of two areas in the image. The areas are the one where the landmark may
+    appear, and the one of the ray's own noise. cost: deviation + vague + the cost of the range."""
 
     ray: Ints
     landmark: Ints
@@ -116,7 +116,7 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
         ahead = np.einsum("ei,ei->e", landmarks.position[index] - obs.origin[ray], obs.direction[ray]) > MIN_DEPTH
         return ray[ahead], index[ahead]
     lines, spread = obs.by_label, np.linalg.eigvalsh(landmarks.covariance)[:, -1]
-    if pose is not None:  # Twice its diagonal blocks are an upper bound of the covariance for any correlation.
+    if pose is not None:  # Twice the diagonal blocks of `pose` bound its covariance, whatever the correlation.
         turn, move = (2 * gate * np.linalg.eigvalsh(pose[lines.order, i : i + 3, i : i + 3])[:, -1] for i in (0, 3))
     rays, found = list[Ints](), list[Ints]()
     for label in np.flatnonzero(np.diff(lines.bounds)).tolist():

@@ -44,8 +44,8 @@ _ABOVE_CHANCE = 3.0
 """The least excess of a point's support over that of stray rays, in standard deviations. A larger one finds surer points."""
 _CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search. A larger one drops weak objects.
 _CLEAR_MOTION = 3.0
-"""The log odds of a moving point over a point at rest above which several points at rest are tried for the rays. With a
-smaller value, they are tried more often, which takes time."""
+"""Several points at rest are tried for rays if the log odds of a moving point over one point at rest exceed this value. A
+smaller value tries more often, which takes time."""
 _EXPLAINED = 0.9
 """The least share of the rays of moving points that points at rest must explain to replace them. With a smaller share, parts
 of the path of a moving thing become objects. With a larger share, wrong boxes keep things at rest from being found."""
@@ -120,7 +120,7 @@ def associate_globally(
             state, likely = _drop_all(task, _alternate(task, fused))
     state, likely = _by_size(task, state, likely, sized)
     if solved or keyframes.localized_every:
-        # This comes last: the things of these bundles get no landmarks, so a further assignment would give their rays back.
+        # This step comes last. The things of these bundles get no landmarks, so a later assignment would undo the step.
         state, likely = _kept(task, without_smaller_bundles(state, sized), likely)
     return replace(_result(state, likely, ray), refuted=(refuted & (state.matched < 0))[np.argsort(ray)])
 
@@ -128,10 +128,10 @@ def associate_globally(
 def _search(task: _Task, state: State, excluded: Landmarks) -> tuple[State, Bools, State]:
     """Search for landmarks, and drop unlikely ones, until a search finds none. excluded: landmarks that must not be found.
 
-    If there are ranges at localised poses, a ray with a wrong range first supports no point at all. A robot that passes a
-    row of equal things sees one after the other in the same direction. These rays meet far away, at a point that has more
-    rays than each thing, and no range confirms it. Where ranges are missing, `ranged_by_size` may show them. Later, and at
-    poses that drift, wrong ranges only lower the support. With drift, a right range may seem wrong on a later visit.
+    A robot that passes a row of equal things sees one thing after another in the same direction. These rays meet far away,
+    at a point with more rays than each thing, but no range confirms the point. So at localised poses, a ray whose range is
+    wrong for a point gives it no support in the first searches. `ranged_by_size` may give missing ranges. In later searches,
+    and at poses that drift, wrong ranges only lower the support. With drift, a right range may seem wrong on a later visit.
 
     Also returns the rays (R,) that belonged to a dropped landmark, and the landmarks that seemed to move, with their rays.
     """

@@ -37,16 +37,16 @@ _USUAL = 0.2
 """The least share of the pairs of meeting rays that show the usual size of a label. In simulated rows of equal things the
 share was 0.24 to 0.31. With a larger share, fewer labels have a usual size."""
 _CLEARLY_USUAL = 0.1
-"""The least share of the pairs that show the usual size, if this size is clear (`_RIVAL`). In a longer row, fewer pairs are
-rays to one thing. The share was 0.13 to 0.18 along simulated streets with cars and lamp posts. With a larger share, fewer
-labels have a usual size."""
+"""The least share of the pairs that show the usual size, for a size that is clear (`_RIVAL`). In a longer row, fewer pairs
+are rays to one thing. The share was 0.13 to 0.18 along simulated streets with cars and lamp posts. With a larger share,
+fewer labels have a usual size."""
 _RIVAL = 3.0
-"""The usual size is clear if the pairs that show it are at least this multiple of the pairs that show any other size. Along
+"""The usual size is clear if its number of pairs is at least this multiple of the number of pairs of any other size. Along
 the simulated streets, the multiple was 5 to 9. For a wrong size, of cars that hid each other, it was 2.3. With a larger
 multiple, fewer labels have a usual size."""
 _LARGER = 1 + RANGE_LIMIT * SIZE_SPREAD
-"""The multiple of the usual size above which a pair of rays meets too far away. With a larger value, farther points count as
-the thing."""
+"""A pair of rays meets too far away if its boxes show a thing larger than this multiple of the usual size. With a larger
+value, farther points count as the thing."""
 _BEYOND = 0.2
 """Sizes count if at least this share of the pairs of meeting rays meets too far away. The share was 0.28 to 0.34 in
 simulated rows of equal things, and at most 0.12 in rooms. With a larger share, sizes count in fewer logs."""
@@ -90,8 +90,8 @@ def ranged_by_size(obs: Observations, sized: Bools, gate: float, parallax: float
 def _usual_size(obs: Observations, gate: float, parallax: float, rng: np.random.Generator) -> tuple[int, float] | None:
     """Return a side of the things of one label, 0 for the width and 1 for the height, and the usual size (m) of this side.
 
-    More pairs of meeting rays show this size than any other. The side counts on which more pairs agree, because one of
-    the two may change with the view. The result is None if too few pairs show one size, or if few pairs meet so far away
+    More pairs of meeting rays show this size than any other. The side on which more pairs agree is returned, because the
+    other side may change with the view. The result is None if too few pairs show one size, or if few pairs meet so far away
     that they show a much larger thing.
     """
     first, second = _draw(obs, _SIZE_PAIRS, rng)

@@ -58,8 +58,8 @@ def unknown_density(obs: Observations, rows: Ints, expected: PredictedLandmarks,
     """Return the expected number (n,) of unknown objects with the label of the ray's landmark, per steradian along each ray.
 
     Unknown objects are assumed to be everywhere in the room, and to be visible as far as a landmark was seen. rows: (n,) the
-    landmark of each ray. novelty: the recent number of boxes of unknown objects for each box of a known object. It stands
-    for the ratio of unknown to known objects.
+    landmark of each ray. novelty: the recent number of boxes of unknown objects for each box of a known object. This number
+    is taken as the ratio of unknown to known objects.
     """
     position, label = expected.position[: expected.landmarks], expected.label[: expected.landmarks]
     low, high = position.min(axis=0), position.max(axis=0)

@@ -25,9 +25,9 @@ def fused_labels(state: State, gate: float) -> Bools:
     must have the landmark's size. There must be more explained boxes than by chance, and fewer than the landmark's own
     boxes.
 
-    A thing right beside the landmark also has such boxes, if the detector misses the landmark. But such a thing also has
-    boxes in frames in which the landmark has one. So boxes of the label that the landmark explains, and that lie beside its
-    own box, tell what to expect by chance. Boxes on its own box do not count, because a detector may draw one thing twice.
+    If the detector misses the landmark, boxes of a thing right beside it are also explained. But this thing also has boxes
+    in frames with a box of the landmark. So the boxes of the label that lie on the landmark, but beside its own box, show
+    what to expect by chance. Boxes on its own box do not count, because a detector may draw one thing twice.
     """
     obs, accepts = state.obs, state.landmarks.accepts
     if accepts.all() or not len(state.owner):  # There is no other label, or no landmark.

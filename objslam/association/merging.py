@@ -20,20 +20,20 @@ _OBJECT_COST = 10.0
 """The cost of one more object in squared deviations. BIC's cost, ln of the number of rays for each coordinate, is added."""
 _SHARED_SPACE = (0.35, 0.5)
 """The largest distances of two landmarks that fill one space. The first is a share of the smaller size, and the second is a
-share of the larger size. One of the two is enough. Larger shares merge more landmarks."""
+share of the larger size. A distance below either limit is enough. Larger shares merge more landmarks."""
 _MOST_APART = 0.1
 """The largest share of frames in which one object may look like two. It is a share of the rarer landmark's rays, of the
 frames that should show both landmarks, or of the frames with boxes of both. A larger share merges more landmarks."""
 _OFTEN = 5
-"""The least number of frames with boxes of two landmarks that shows that one of them has second boxes of the other. Nearly
-all such pairs of boxes must lie on each other, and the landmarks must be nearer than the smaller size. Things do not go
-through each other. A larger number leaves second boxes in short logs."""
+"""One of two landmarks has second boxes of the other only if at least this number of frames have boxes of both. Nearly all
+such pairs of boxes must lie on each other, and the landmarks must be nearer than the smaller size. Things do not go through
+each other. A larger number leaves second boxes in short logs."""
 _MIN_EXPECTED = 5.0
 """The least number of frames that are assumed to show both landmarks if detections are independent. A larger number merges
 more landmarks."""
 _DUPLICATE_OVERLAP = 0.5
-"""The least intersection over union of two boxes in one frame with which the second box says nothing about a second object.
-With a smaller overlap, rays of two neighbours that overlap in many frames become one object."""
+"""If two boxes in one frame have at least this intersection over union, the second box is no evidence for a second object.
+With a smaller value, two neighbours whose boxes overlap in many frames become one object."""
 _NEIGHBOURS = 8  # The number of nearest landmarks that each one is compared with. A larger value costs time in dense scenes.
 _REACH_GATES = 2.0
 """The distance up to which two landmarks are compared, in gates of the noise of their rays. This distance is large because

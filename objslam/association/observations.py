@@ -34,9 +34,9 @@ SIZE_LOSS = 6.0
 """The largest cost of a size, unless the box is of a nearer thing. This cost is less than a usual gate, so that the bearing
 alone can still match a half hidden thing. A larger value loses more boxes of half hidden things."""
 _ONE_FACTOR = 3.84
-"""The largest squared deviation from one factor with which both sides count as larger by this factor. It is chi-squared of 1
-degree of freedom at 95 %. With a larger value, boxes with other proportions than the landmark's also count as boxes of
-nearer things."""
+"""Both sides of a box count as larger by one factor if their squared deviation from this factor is at most this value. It is
+chi-squared of 1 degree of freedom at 95 %. With a larger value, boxes with other proportions than those of the landmark also
+count as boxes of nearer things."""
 RANGE_LIMIT = 3.0
 """The deviation, in standard deviations, from which a range counts as wrong. A larger value believes more ranges."""
 
@@ -256,13 +256,13 @@ class UsualSizes:
     ) -> Floats:
         """Return the cost (E,) >= 0 of the size of the box in each match, in squared standard deviations.
 
-        Bearings do not distinguish a small thing from a large thing on the same line of sight. If only one of the two is
-        detected, its box fits the bearings of both, but the size of only one. Boxes of another size than usual cost more.
-        The cost is at most `SIZE_LOSS`, because a thing can be half hidden, and a box can have two things side by side. The
-        cost has no limit if both sides are larger than usual by one factor and the range is too short. Then size and range
-        show a nearer thing. A box without a size, and a landmark with few boxes, cost nothing. ray, landmark: (E,) of the
-        matches. distance: (E,) m, from the camera to the landmark. distance_sigma: (E,) m, the standard deviation of the
-        distance, by default 0.
+        Bearings do not distinguish a small thing from a large thing on the same line of sight. If only one of the two things
+        is detected, its box fits the bearings of both things, but the size of only one. So boxes of an unusual size cost
+        more. The cost is at most `SIZE_LOSS`, because a thing can be half hidden, and a box can have two things side by
+        side. The cost has no limit if both sides are larger than usual by one factor and the range is too short. Then size
+        and range show a nearer thing. A box without a size, and a landmark with few boxes, cost nothing. ray, landmark: (E,)
+        of the matches. distance: (E,) m, from the camera to the landmark. distance_sigma: (E,) m, the standard deviation of
+        the distance, by default 0.
         """
         cost = np.zeros(len(ray))
         some = np.flatnonzero((self.number[landmark] >= SIZED_BY) & (obs.size[ray] > 0).all(axis=1))

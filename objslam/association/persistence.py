@@ -2,7 +2,8 @@
 
 The filter is from Rosen, Mason and Leonard 2016, Towards lifelong feature-based mapping in semi-static environments. The
 time for which an object stays is exponentially distributed. So the filter needs only the last probability and the time since
-then. A session is one measurement: it finds the object or misses it. A miss counts only as far as the object was in view.
+then. A session is one measurement: the session finds the object or misses it. A miss counts only as far as the object was in
+view.
 """
 
 import numpy as np
@@ -20,7 +21,8 @@ _BY_CHANCE = 0.02
 """The probability that a session finds something at a place where there is no object. A larger value trusts a find less."""
 _CONCENTRATION = 5.0
 """The sum of the parameters of the beta distribution of an object's detection rates in different sessions. With a larger
-value, the rates are more alike, and many misses count more. Offline association finds values around this one."""
+value, the rates of different sessions are more alike, and many misses count more. Offline association finds values around
+this one."""
 _RATE = 0.5
 """The assumed share of looks that detect a new object. A larger value makes a miss count more."""
 _LOOKS = 4.0

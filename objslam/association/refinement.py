@@ -22,7 +22,7 @@ refinement down."""
 _ITERATIONS = 6  # The Gauss-Newton steps of a refinement. Few are enough, because association refines repeatedly.
 _STILL = 1e-11
 """The longest step (m) of a point that counts as at rest. Rounding errors in a map of kilometres are as large. With a larger
-value, positions are less exact, and an association is less surely the same from another start."""
+value, positions are less exact, and the association depends more on its start."""
 _PAIRS_AT_ONCE = 1 << 13
 """The most pairs of a ray and a point whose terms `refine` computes together, which fit into the processor's cache. A larger
 number reads from memory, and a smaller one needs more calls."""

@@ -31,8 +31,8 @@ _FRONT_SHARE = 0.95
 objects a front."""
 _CLOSER = (0.3, 0.1)
 """The least distance from an occluder to the object behind it: in m, and as a share of the object's distance. The larger one
-counts. Half the sum of the two sizes replaces the first value if that is larger, because on a table a thing may hide its
-neighbour. Larger values hide fewer objects."""
+counts. Half the sum of the two sizes replaces the first value if this half sum is larger, because on a table a thing may
+hide its neighbour. Larger values hide fewer objects."""
 _SAME_SIDE = np.cos(np.radians(45.0))
 """The cosine of the largest angle between two views of one side of an object. A smaller cosine counts more frames."""
 _FILLED = 0.6  # The share of a box's width and height that its object certainly fills. A larger value occludes more.
@@ -40,11 +40,11 @@ _FILLED = 0.6  # The share of a box's width and height that its object certainly
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """The observed frames. stamps: (F,) s. cameras: all cameras. camera: (F,) the camera of each frame. map_T_camera:
-    (F, 4, 4). A box counts if it is at least `margin` px, and at least `margin_share` of its size, away from the image edge.
-    With a negative margin, each box counts. drift: (F, 6, 6) as in `Keyframes`, None if the poses do not drift. cut: the
-    boxes in these frames that the image's edge cuts off, None if unknown. Their `frame` is the index of an observed frame.
-    localized: whether a localisation gives the poses, so that the robot comes back to the same place in the map.
+    """The observed frames. stamps: (F,) s. cameras: all cameras. camera: (F,) the camera of each frame. map_T_camera: (F, 4,
+    4). A box counts if it is at least `margin` px, and at least `margin_share` of its size, away from the image edge. With a
+    negative margin, each box counts. drift: (F, 6, 6) as in `Keyframes`, None if the poses do not drift. cut: the boxes in
+    these frames that the image's edge cuts off, None if unknown. Their `frame` is the index of an observed frame. localized:
+    whether a localisation gives the poses, so that a place keeps its position in the map when the robot comes back.
     """
 
     stamps: Floats

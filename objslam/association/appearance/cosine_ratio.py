@@ -21,7 +21,7 @@ _LEAST_APART = 0.3
 used. Its unit is the standard deviation of the cosine between a box and an object with many boxes. A larger value leaves
 more weak vectors unused. With random vectors, the difference is 0.1 in a log of a few hundred boxes."""
 _LEAST_SHARE = 1e-3
-"""The least share of `between` in the variance, and the least standard deviation of the cosines. It only keeps the ratio
+"""The least share of `between` in the variance, and the least standard deviation of the cosines. Both only keep the ratio
 finite."""
 MOST_RATIO = 3.0
 """The largest absolute log ratio of a ray and a landmark. A larger value trusts vectors more. An object can look different

@@ -20,11 +20,11 @@ class by half of `_CLASS_SIZE` is detected from further away by this factor. A l
 away."""
 _BOXES = 50
 """The least number of boxes of other landmarks with which a class has distances of its own. A class with fewer boxes takes
-the distances of all classes. With a larger number, more classes do so."""
+the distances of all classes. With a larger number, more classes take them."""
 _LANDMARKS = 3
 """The least number of landmarks with which a class has a usual distance of its own. A class with fewer landmarks takes the
-usual distance of all classes. With a larger number, more classes do so. One of three landmarks may be wrong without effect
-on their median."""
+usual distance of all classes. With a larger number, more classes take it. One wrong landmark of three does not spoil the
+median."""
 _VIEW_SIZE, _THINGS = 0.25, 5.0
 """`_VIEW_SIZE` is the assumed standard deviation of ln size between two views of one thing. It is the same as `SIZE_SPREAD`
 in `observations`. With `_THINGS` landmarks, the measured deviation has the same weight as the assumed one. With a larger
@@ -51,10 +51,10 @@ class UsualViews:
 
     state: the landmarks. distance: (N,) m, the distance within which most boxes of the class lie. log_density: (N,) ln of
     the number of things of the class per m^3. ln_size: (R,) ln of the width or of the height of the thing in each box, in m
-    per m of its distance. The side is taken whose sizes scatter less. The value is NaN for a box without a size. size: (N,)
-    the median ln size of each landmark, NaN if it has few boxes. view: the standard deviation of ln size between views of
-    one thing. class_mean, class_spread: (N,) mean and standard deviation of ln size among the other landmarks of the class.
-    If the class has no others, all other landmarks count. The mean is NaN without other landmarks.
+    per m of its distance. Of both sides, the side with the smaller scatter is used. The value is NaN for a box without a
+    size. size: (N,) the median ln size of each landmark, NaN if it has few boxes. view: the standard deviation of ln size
+    between views of one thing. class_mean, class_spread: (N,) mean and standard deviation of ln size among the other
+    landmarks of the class. If the class has no others, all other landmarks count. The mean is NaN without other landmarks.
     """
 
     state: State

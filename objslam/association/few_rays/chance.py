@@ -34,8 +34,8 @@ _WRONG_RANGE = 0.1
 _TRIED = 25
 """The number of tried values, for the share of strays and for the density of objects. A larger number is more exact."""
 _DENSITY_FACTORS = np.geomspace(1e-4, 10.0, _TRIED)
-"""The tried factors on the density of objects, which is first computed from the density of boxes. A factor is needed because
-objects do not lie everywhere where boxes could show them. A larger upper limit keeps more landmarks with few rays."""
+"""The tried factors on the density of objects that follows from the density of boxes. A factor is needed because objects do
+not lie everywhere where boxes could show objects. A larger upper limit keeps more landmarks with few rays."""
 _SHARES = np.geomspace(1e-4, 1.0, _TRIED)
 """The tried shares of stray boxes. A smaller lower limit trusts the boxes of a clean log more."""
 _PRIOR_STRAYS = 1.0
@@ -168,7 +168,7 @@ def ray_odds(
     point from the ray. distance: (..., R) m, of the point from the camera. noise: factor on the noise of the rays. A
     deviation beyond `gate` costs as much as one at the gate.
     """
-    # The tables can be of hundreds of points and all rays, so each is changed in place where that is possible.
+    # The tables can have hundreds of points and all rays, so they are changed in place where possible.
     distance2 = distance**2
     spread = obs.sigma**2 * distance2
     spread += obs.position_sigma**2
@@ -203,9 +203,9 @@ def ray_odds(
 def unmatched_costs(state: State, edges: Edges, strays: Strays, gate: float) -> Floats:
     """Return for each match the cost (E,) of its ray if the ray had no landmark.
 
-    It is -2 ln of the density of strays, relative to the density of the landmark's rays at their peak, and at most `gate`.
-    So it is below `gate` only where strays are dense compared with the noise of the rays. Boxes within the gate of the
-    landmark do not count as strays.
+    The cost is -2 ln of the density of strays, relative to the density of the landmark's rays at their peak, and at most
+    `gate`. So the cost is below `gate` only where strays are dense compared with the noise of the rays. Boxes within the
+    gate of the landmark do not count as strays.
     """
     obs, noise = state.obs.take(edges.ray), state.landmarks.noise[edges.landmark]
     distance = np.linalg.norm(state.landmarks.position[edges.landmark] - obs.origin, axis=1)

@@ -17,9 +17,9 @@ _HALF = 3.0
 """The squared deviation at which a ray has half of its full weight. On 30 simulated streets, 2 and 4 give the same objects,
 and 6 finds 1 % fewer. With a larger value, rays of other things pull more."""
 _DENSE = 500
-"""The largest number of landmarks with which the normal equations are a dense matrix, because things in a room are seen
-together. With more landmarks, the matrix is sparse, because the things lie along a way, and hardly any two are seen from one
-place. With a larger number, the time of large maps grows with its cube."""
+"""Up to this number of landmarks, the normal equations are a dense matrix, because things in a room are seen together. With
+more landmarks, the matrix is sparse, because the things lie along a way, and hardly any two are seen from one place. The
+time of a dense solve grows with the cube of the number of landmarks."""
 _STEPS = 8
 """The number of steps of the robust fit. A larger number is more exact and slower."""
 _WIDE = 3
@@ -91,7 +91,7 @@ def _solved(
         grouped_sums(weight.reshape(-1, 9), index, size).reshape(-1, 3, 3) for index, size in ((owner, count), (of, places))
     ]
     inverse = np.linalg.inv(own[1] + np.eye(3) / prior)
-    # Without the places, which outnumber the landmarks, the rest of the system is small.
+    # There are more places than landmarks. So the places are eliminated first, and a small system remains.
     order = np.argsort(of, kind="stable")
     begin = np.searchsorted(of[order], np.arange(places + 1))
     between = bsr_array((-weight[order], owner[order], begin), shape=(3 * places, 3 * count)).tocsr()
@@ -109,7 +109,7 @@ def _solved(
 def _sigma(weight: Floats, owner: Ints, of: Ints, count: int, places: int, prior: float) -> Floats:
     """Return the standard deviations (G,), m, of the offsets of the places.
 
-    A ray is as informative about its place as the other rays are about its landmark. So this is one round of belief
+    A ray tells as much about its place as the other rays tell about its landmark. The computation is one round of belief
     propagation (Weiss and Freeman, Neural Computation 13, 2001).
     """
     alone = weight - weight @ np.linalg.solve(weight + np.eye(3) / prior, weight)  # With the errors of the place as noise.

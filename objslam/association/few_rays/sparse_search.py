@@ -21,7 +21,7 @@ _MOST_POINTS = 512
 _MORE_RAYS = 3.0
 """The log odds that further rays may add to the log odds of a pair. A larger value tries more points."""
 _REFINEMENTS = 2
-"""How often each point moves to the best fit of its rays. A larger number costs time."""
+"""The number of times that each point moves to the best fit of its rays. A larger number costs time."""
 _DAMPING = 1e-6
 """The share of the information added in all directions. Unobserved directions then stay unchanged. A larger share slows the
 refinement down."""

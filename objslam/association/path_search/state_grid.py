@@ -12,8 +12,8 @@ from objslam.core.types import Keyframes
 _SHIFTS, _TURNS = 9, 14
 """The number of grid steps to each side, along x and y, and in yaw. Larger numbers reach farther, and take longer."""
 STRETCH = 0.5
-"""The largest standard deviation of the drift of the heading in a stretch, in grid steps of yaw. A larger value makes longer
-stretches, in which the odometry counts as exact."""
+"""The largest standard deviation of the drift of the heading in a stretch, in grid steps of yaw. The odometry counts as
+exact in a stretch. A larger value makes longer stretches."""
 _STRETCH_SHIFTS = 2.0
 """The greatest length of a stretch, in grid steps of a shift. A larger value makes longer stretches, for which a single
 correction is less exact."""

@@ -21,12 +21,11 @@ _BESIDE = 40
 """The largest number of shifts that are tried, beginning with the smallest shift. A shift moves one object onto another
 partner. A larger number looks farther around, and takes longer."""
 _MOST = 20_000
-"""The largest product of the number of tried shifts and the number of objects in map a. So few shifts are tried in large
-maps. In a large map, it hardly ever happens that all rows of objects match their neighbours. A larger number takes
-longer."""
+"""The largest product of the number of tried shifts and the number of objects in map a. With this limit, large maps get few
+shifts. In a large map, it is rare that all rows of objects match their neighbours. A larger number takes longer."""
 _SIZES = (0.0, -1.0, 1.0, -2.0, 2.0)
 """The sizes at which a search starts, in standard deviations of the size of one map relative to the other. A true size
-between them is at most half a standard deviation from the nearest one, and the wide gates of the first round allow for this.
+between two starts is at most half a standard deviation from one of them. The wide gates of the first round allow for this.
 More sizes take longer."""
 _WIDE = 0.5
 """The share of the standard deviations of tilt and size by which the gates of the first round are wider. 0.5 is half the

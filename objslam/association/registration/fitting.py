@@ -61,7 +61,7 @@ class Problem:
         height = np.clip(moved[..., 2], -self.apart, self.apart) + label * 4 * self.apart
         found = []
         nearest, nearest_alike = (min(k, len(self.b.label)) for k in (_DENSITY_NEIGHBOURS, _ALIKE_NEIGHBOURS))
-        others = max(nearest - 2, 1)  # Without the match and the farthest object, the mean is right.
+        others = max(nearest - 2, 1)  # The mean is right if the match and the farthest object do not count.
         counted = (
             (others / len(self.b.label), _farthest(self._level, everything, nearest)),
             (nearest_alike / self._count[label], _farthest(self._alike, alike, nearest_alike)),
