@@ -17,7 +17,8 @@ MAX_PIXELS = 1 << 26
 number of pixels takes 3 s. No robot's camera has more pixels."""
 _MAX_SCANNED = 1 << 29
 """The largest product of the number of pixels and the number of scans of a JPEG that is decoded. A larger product takes more
-time. 16 million pixels in 100 scans are three times this product, and took 4 s. A progressive JPEG has about ten scans."""
+time. An image of 16 million pixels in 100 scans has three times this product, and took 4 s. A progressive JPEG has about ten
+scans."""
 _JPEG, _SCAN = b"\xff\xd8\xff", b"\xff\xda"  # The first bytes of a JPEG, and the marker before each scan.
 
 

@@ -18,8 +18,8 @@ from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
 
 _IN_ORDER = 0.5
-"""The least share of the rows of a file that must be in the order of time. A smaller share in order is an error. A file in
-another order has a far smaller share. A larger value also rejects files of a robot whose clock was set back."""
+"""The least share of the rows of a file that must be in the order of time. A smaller share is an error. A file that is
+sorted in another way has a far smaller share. A larger value also rejects files of a robot whose clock was set back."""
 _PLACES = 3
 """The largest number of dropped rows for one reason whose places (file:line) the ledger gets. A larger number gives more
 examples."""

@@ -67,8 +67,8 @@ def read_pose_table(path: Path, ledger: Ledger) -> Table:
 
 
 def _read_numbers(path: Path, ledger: Ledger) -> Table:
-    """Return a table with 8 columns, also for a file with "stamp x y yaw". The first line with 8 or 4 numbers determines
-    which form the file has."""
+    """Return a table with 8 columns, also for a file with "stamp x y yaw". The first line with 8 or 4 numbers shows which of
+    both forms the file has."""
     lines = [(number, text.replace(",", " ")) for number, text in read_lines(path, ledger)]
     names = lines[0][1].split() if lines else []
     if len(names) in (4, 8) and not any(parse_numbers([name]) for name in names):

@@ -1,5 +1,5 @@
-"""Stores for each label of a session whether it is a name, a class, or the label of things that move. One label that is no
-name says little about the other labels, but a few such labels say much."""
+"""Stores for each label of a session whether it is a name, a class, or the label of things that move. A single label that is
+no name says little about the other labels, but several such labels say much."""
 
 from dataclasses import dataclass, field
 
@@ -9,8 +9,8 @@ from objslam.core.arrays import Bools, Ints
 
 _CLASSES = 0.1
 """The share of labels with several objects above which all labels count as classes. A single such label never has this
-effect. With a larger share, two things of one label that no frame shows together pass for one thing for longer. With a
-smaller share, names are given up sooner. Then a session tells equal things apart by their places alone."""
+effect. With a larger share, two things of one label that no frame shows together count as one thing for longer. With a
+smaller share, labels stop counting as names sooner. A session then tells equal things apart by their places alone."""
 
 
 @dataclass

@@ -26,9 +26,9 @@ class Rounds(ABC, Generic[Answer, Told]):
     A round begins when the number of keyframes has grown by the factor `growth` since the last round began. So the time of
     all rounds is proportional to the number of keyframes. The map is corrected when the number has grown by the share
     `delay` since the round began. Both steps wait for a keyframe without other tasks (`is_quiet`). If the process is done by
-    then, the map does not depend on the machine's speed. If it is late, a `patient` session waits for it, and any other
-    session goes on. The journal receives each correction with its keyframe. So a resumed session corrects its map at the
-    same keyframe.
+    then, the map does not depend on the machine's speed. If the process is late, a `patient` session waits for its answer,
+    and any other session goes on. The journal receives each correction with its keyframe. So a resumed session corrects its
+    map at the same keyframe.
     """
 
     growth: float
@@ -46,8 +46,8 @@ class Rounds(ABC, Generic[Answer, Told]):
         """
         self._mapper, self._record, self._patient = mapper, record, patient
         self._next = first or math.inf
-        # The number of keyframes when a round began, and its request. Once the process has the request, it is dropped to
-        # save memory.
+        # The number of keyframes when a round began, and its request. Once the process has the request, the request is
+        # dropped to save memory.
         self._asked: tuple[int, Request[Answer] | None] | None = None
         self._worker: Worker[Answer] = Worker()
         self._known: deque[Told] = deque()

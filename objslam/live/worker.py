@@ -60,7 +60,7 @@ class Worker(Generic[Answer]):
             self._process = _start()
         self._waiting = [pickle.dumps(request)]
         thread = threading.Thread(target=self._run, name="objslam worker", daemon=True)
-        with suppress(OSError, RuntimeError):  # There is no memory for a thread. Then `result` returns None.
+        with suppress(OSError, RuntimeError):  # Without memory for a thread, `result` returns None.
             start_thread(thread)
             self._thread = thread
 
@@ -105,7 +105,7 @@ class Worker(Generic[Answer]):
             if answer is not None:
                 self._answer = pickle.loads(answer)  # noqa: S301 - this program wrote it
         limit.cancel()
-        if self._answer is None:  # It failed, or its answer is None. The next request gets a new process.
+        if self._answer is None:  # The request failed, or its answer is None. The next request gets a new process.
             _reap(process)
 
 
@@ -164,8 +164,8 @@ def main() -> None:
 
 
 def _receive(requests: queue.SimpleQueue[bytes]) -> None:
-    """Read requests until stdin ends, and then end this process. If the session is killed, stdin ends, and no other sign
-    reaches this process."""
+    """Read requests until stdin ends, and then end this process. If the session is killed, the end of stdin is the only sign
+    that reaches this process."""
     try:
         with os.fdopen(os.dup(sys.stdin.fileno()), "rb") as asked:  # Python waits for the lock of sys.stdin when it ends.
             while (content := _read(asked)) is not None:

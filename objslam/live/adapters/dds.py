@@ -189,9 +189,9 @@ class DdsAdapter:
         """Return whether this reader pushes a message of the publisher with this handle. stamp: the time of sending, ns.
 
         Two readers may receive one message, because a best-effort reader receives from reliable publishers too. The reader
-        of the publisher's own kind pushes it. Until that reader receives the publisher, the other reader pushes the
-        publisher's messages, because a robot may send as soon as anybody listens. If the publisher is unknown, the reader
-        with the strictest QoS pushes.
+        of the publisher's own kind pushes it. Until the reader of the own kind receives the publisher, the other reader
+        pushes the publisher's messages, because a robot may send as soon as anybody listens. If the publisher is unknown,
+        the reader with the strictest QoS pushes.
         """
         if self._publications.kind(handle) is None:
             self._look_around(found)

@@ -33,7 +33,7 @@ share suits slower machines, but corrects later."""
 
 _CHANGED = 0.05
 """The change of a bearing, in its standard deviations, above which the bearing in the graph is turned again. A larger value
-changes the graph less often, but bearings then point to the centres of older bodies."""
+changes the graph less often, but bearings point to the centres of older bodies for longer."""
 
 
 @dataclass(frozen=True)

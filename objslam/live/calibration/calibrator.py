@@ -39,17 +39,17 @@ corrected. After a short drive, the estimates of two rounds differ by about this
 rarely."""
 _NO_DELAY = 2.0
 """The largest delay of a camera clock that a session does not correct, in standard deviations of the estimate. With a
-correction, each frame would wait longer for its pose, by the offset of the clock, and the gain is small. A larger value maps
-sooner, but with larger errors. At 1, one right clock in six looks late in each round. The first round then made each of the
-next 600 frames wait 65 ms. At 2, one right clock in forty looks late."""
+correction, each frame would wait longer for its pose, by the offset of the clock, although the gain is small. A larger value
+maps sooner, but with larger errors. At 1, one of six right clocks looks late in each round. A first round then made each of
+the next 600 frames wait 65 ms. At 2, one of forty right clocks looks late."""
 
 
 _LATE = frozenset(("turn_slip", "turn_per_m", *LENS))
 """The kinds of errors that a session estimates only at its end, if no calibration file has them. After a few curves, a slip
 looks like a wrong scale of turns. After a short drive, an error of the lens looks like an error of the clock together with a
-turn of the camera. So the other estimates would become worse.
-Because of the slip, three of four sessions of MRCLAM 6, robot 3, had up to five landmarks too many while the robot drove.
-Because of the lens, the map of a simulated drive with a late clock was 12 cm off after 100 frames instead of 3 cm."""
+turn of the camera. So the other estimates would become worse. When slip was estimated while the robot drove, three of four
+sessions of MRCLAM 6, robot 3, had up to five landmarks too many. When the lens was estimated, the map of a simulated drive
+with a late clock was 12 cm off after 100 frames instead of 3 cm."""
 
 
 def observed(found: Calibration, now: Floats) -> Calibration:
@@ -73,7 +73,7 @@ def observed(found: Calibration, now: Floats) -> Calibration:
 
 
 def _waits_in_vain(found: Calibration, now: Floats) -> bool:
-    """Return whether frames wait because of the value of a camera clock in `now` (P,), but this clock may be right
+    """Return whether frames wait because of the value of a camera clock in `now` (P,), although this clock may be right
     (`observed`)."""
     clock = np.array([kind(name) == "clock" for name in found.names], dtype=bool)
     return bool((clock & (now > 0) & (found.values == 0)).any())

@@ -106,9 +106,9 @@ def _leave(entity: Any) -> None:
     """Leave a domain with all its entities, before the interpreter ends.
 
     Threads of the DDS library release Python's types. A thread that asks for the interpreter while the interpreter ends is
-    stopped for ever. The library would wait for this thread, and so the process would never end. The domain is left while
-    the thread of `_listen` still reads the log of the library. Later, nobody would read this log. A flood of malformed
-    packets would then fill the pipe, and the library would wait.
+    stopped for ever. The library would wait for this thread, and so the process would never end. The domain must be left
+    while the thread of `_listen` still reads the log of the library. Without this thread, a flood of malformed packets would
+    fill the pipe of the log, and the library would wait.
     """
     entity.__del__()  # The binding offers no other way to delete an entity. A second call does nothing.
 

@@ -15,8 +15,8 @@ from objslam.live.mapper.tracks import Track
 _NOVELTY_WEIGHT = 0.02  # The weight of one frame in MapState.novelty. A larger weight adapts sooner, with more noise.
 
 _NEAR_BOX = np.cos(np.radians(20.0))
-"""The cosine of the largest angle, 20 degrees, between a landmark and a box of its label if the landmark's body is used. A
-smaller angle saves time. If a pose is so uncertain that a more distant box may match, bodies do not matter."""
+"""The cosine of 20 degrees. The body of a landmark is used if a box of its label is within this angle of the landmark. A
+smaller angle saves time. If the pose is so uncertain that a more distant box may match, bodies do not matter."""
 
 
 def associate(
@@ -106,9 +106,9 @@ def _shown_twice(label: Ints, one: Bools) -> list[int]:
 def first_boxes(score: Floats, one: Bools) -> Ints:
     """Return the boxes that may match something or begin a track. Of the boxes that may show one thing, only the surest may.
 
-    A second box of a thing would become a second landmark, or pull the first landmark aside. A thing that stands behind
-    another thing of its label loses some boxes. It keeps the boxes from places where the robot sees both things side by
-    side. The end of the session uses all boxes. score: (n,). one: (n, n) as in `may_be_one`.
+    A second box of a thing would become a second landmark, or pull the first landmark aside. A thing behind another thing of
+    its label loses some boxes, but keeps the boxes from places where the robot sees both things side by side. The end of the
+    session uses all boxes. score: (n,). one: (n, n) as in `may_be_one`.
     """
     first = np.zeros(len(score), dtype=bool)
     for i in np.argsort(-score, kind="stable").tolist():

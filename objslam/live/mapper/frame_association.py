@@ -19,8 +19,8 @@ _VIEW = np.cos(np.radians(40.0))  # The cosine of the largest angle from a box t
 _BEYOND = 1.5  # Candidates are within this multiple of the largest observed distance. A larger factor costs time.
 _NEAR = 10.0  # Landmarks in view and nearer than this (m) are always candidates. A larger distance costs time.
 _ROUGH = 3.0
-"""The ratio between the image area of a candidate's uncertainty and the image area of a ray's noise above which the
-candidate is rough. With a larger value, fewer candidates are rough."""
+"""A candidate is rough if the image area of its uncertainty exceeds this multiple of the image area of a ray's noise. With a
+larger value, fewer candidates are rough."""
 _CLEAR = 6.0  # The least cost difference of the two best candidates, if both are rough. A larger value matches fewer rays.
 _WIDEST = 0.3  # The uncertainty (m) above which a rough candidate is dropped. A larger value matches more boxes.
 _BY_LABEL = 4.0  # The factor on the gate if every label is one object. A larger factor keeps more rays after a drift.
@@ -183,8 +183,8 @@ def _some(edges: Edges, keep: Bools) -> Edges:
 def _with_sizes(edges: Edges, obs: Observations, usual: UsualSizes, to: Floats, spread: Floats) -> Edges:
     """Add the costs of sizes (`UsualSizes.costs`), where a box may belong to several landmarks with a size.
 
-    Sizes only decide between such landmarks, so the least cost of a box is subtracted from all costs of this box. A
-    candidate without a size would otherwise win the box of a landmark that is badly placed, and become its duplicate. usual:
+    Sizes only decide between such landmarks, so the least cost of a box is subtracted from all costs of this box. Otherwise,
+    a candidate without a size would win the box of a badly placed landmark, and become a duplicate of this landmark. usual:
     the sizes of the m candidates. to: (m, 3) m, from the camera to the candidates. spread: (m, 3, 3) m^2, the covariance of
     `to`.
     """

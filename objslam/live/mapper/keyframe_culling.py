@@ -12,7 +12,7 @@ _SHARE = 0.25  # The share of live.max_keyframes that one culling removes. A lar
 _AGAIN = 0.1  # New keyframes before the next culling, as a share of live.max_keyframes. A larger share culls less often.
 _ENOUGH = 10  # The rays that every landmark keeps. A larger number keeps more keyframes and more certain landmarks.
 _LEAST = 3  # The rays that every landmark keeps if too many keyframes stay (_CROWDED). Three rays still fix a position.
-_CROWDED = 1.2  # If _ENOUGH keeps more than this times live.max_keyframes, _LEAST applies. A larger value costs memory.
+_CROWDED = 1.2  # _LEAST applies if _ENOUGH keeps over this multiple of live.max_keyframes. A larger value costs memory.
 
 
 def cull_keyframes(m: MapState) -> None:

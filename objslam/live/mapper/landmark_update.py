@@ -20,8 +20,8 @@ _GROWN = 1.2
 larger factor, sizes are older, and measuring them takes less time."""
 _MOVED = 0.05
 """The motion of a landmark, as a share of its distance from the camera, after which the size of its boxes is measured again.
-The size depends on the distance, because an equal box at a larger distance shows a larger thing. With a larger share, sizes
-are older."""
+The size depends on the distance, because a box of the same size shows a larger thing at a larger distance. With a larger
+share, sizes are older."""
 _BOXES = 20
 """The most boxes that give the size of one landmark. They are spread evenly over all boxes of the landmark. More boxes take
 longer."""

@@ -51,7 +51,7 @@ def _place(m: MapState, row: int) -> None:
     keyframe.
 
     If errors last, each pose has a part of the information that all poses have together. This part depends on the times of
-    the poses before and after. The time until the next pose is assumed to equal the time since the previous pose.
+    the poses before and after. The next pose is assumed to follow after the same time as that since the previous pose.
     """
     k, others = m.keyframes, m.keyframes.localized.copy()
     others[row] = False

@@ -20,9 +20,9 @@ _ANCHORS = 3  # The number of past keyframes that are tried as the start of the 
 _NEAR = 0.25  # A correction above this (m) bends the path before landmarks merge. A larger value leaves more to iSAM2.
 _TURNED = 0.05  # A heading correction above this (rad) bends the path before landmarks merge, as a shift above _NEAR does.
 _AROUND = 6.0
-"""The radius (m) around recognised landmarks in which other landmarks match rays again. Cameras see about as far in a hall.
-In a larger radius, more landmarks match again."""
-_ERA = 15.0  # The time (s) from the sight of recognised landmarks in which those _AROUND match. A longer time matches more.
+"""Other landmarks within this radius (m) of recognised landmarks match rays again. In a hall, cameras see about this far. In
+a larger radius, more landmarks match again."""
+_ERA = 15.0  # Landmarks _AROUND match if seen within this time (s) of the recognised ones. A longer time matches more.
 _ITERATIONS = 5  # The most iterations of the solve after a loop closure. More iterations delay the next frame.
 _TOLERANCE = 1e-3  # The relative decrease of the cost below which the solve gives up. A smaller value takes longer.
 _HOLDS = 0.7  # The share of a loop's rays that must be inliers. A larger share undoes more loops, right and wrong ones.
@@ -54,9 +54,9 @@ def _recognise(
 ) -> place_recognition.Recognition | None:
     """Return how the landmarks in rows `one` surely match the landmarks in rows `two`, or None without a sure match.
 
-    The match must be better than matches between landmarks that some frame shows `together` (N, N). Such landmarks are
-    different, and match only because places look alike. possible: which pairs may be the same. newest: the row of the newest
-    keyframe.
+    The match must be better than matches between landmarks that some frame shows `together` (N, N). Landmarks that a frame
+    shows together are different things, and match only because places look alike. possible: which pairs may be the same.
+    newest: the row of the newest keyframe.
     """
     landmarks, k = m.landmarks, m.keyframes
     pivot = m.graph.pose(int(k.id[newest]))[:2, 3]
@@ -134,7 +134,7 @@ def _merge(m: MapState, now: Ints, old: Ints, rebuild: bool = True) -> None:
 def _expect_around(m: MapState, now: Ints, old: Ints) -> None:
     """Let the long unseen landmarks around the landmarks in rows `old` (P,) match rays again.
 
-    Each gets the drift of the first seen landmark in rows `now` (P,), as if the two had been last seen together.
+    Each of them gets the drift of the first seen landmark in rows `now` (P,), as if the two had been last seen together.
     """
     landmarks = m.landmarks
     drift = landmarks.drift[now[np.argmin(landmarks.first[now])]]

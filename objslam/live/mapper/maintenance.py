@@ -25,7 +25,7 @@ from objslam.mapping.joint.labels import MANY, SECOND
 _EVERY = 10  # The period of every task in keyframes. A larger period keeps duplicates and false landmarks for longer.
 _GROWING = 3  # The keyframe of each period after which tracks and keyframes are dropped and all rays are tested.
 _CLOSING = 6  # The keyframe of each period for merging and removing landmarks. It differs from _GROWING to spread delay.
-_QUIET = 9  # The keyframe of each period without a task. It is odd, because relinearisations (`_BREATH`) are at even ones.
+_QUIET = 9  # The keyframe of each period without a task. It is odd: relinearisations (`_BREATH`) are at even keyframes.
 _BREATH = 2  # The period of relinearisations after a large change, in keyframes. A larger period settles the map later.
 _FIRST = 20  # The number of keyframes at the first full solve. Fewer keyframes have too few rays of any landmark.
 _GROWTH = 1.5  # The growth factor of keyframes between full solves. A larger factor keeps early errors longer.
@@ -34,14 +34,14 @@ _LARGE = 200  # With more keyframes, a rebuild in slices replaces the full solve
 _ODDS = 2.5  # The least log odds that two landmarks are one object, not two neighbours. Larger odds leave more duplicates.
 _HALF = 0.5  # The share of inliers below which a landmark is triangulated again. A larger share redoes more landmarks.
 _VISITS = 6
-"""The least number of changes between inliers and outliers, in time order, that shows two objects of one label. Drift makes
-one run of outliers, which has two changes. With a larger number, both objects need more visits."""
+"""At least this number of changes between inliers and outliers, in time order, shows two objects of one label. Drift makes
+only one run of outliers, with two changes. With a larger number, both objects need more visits."""
 _DRIFT = 5.0
 """The largest assumed drift of a path, as a multiple of the drift in the settings. Real robots drift by up to 3.3 times.
 With a larger value, two objects of a label are recognised as two only if they are farther apart, or visited more often."""
 _DISTANT = 60.0  # The time (s) after which an unseen track with enough rays is dropped. A larger time keeps more tracks.
-_AROUND = 0.15  # The border outside the image that is soon seen, as a share of it. A larger share prepares more landmarks.
-_USUAL = 0.75  # The quantile of all `far` up to which any landmark is soon seen. A larger value prepares more landmarks.
+_AROUND = 0.15  # The border outside the image, as a share of the image, that is soon seen. A larger share prepares more.
+_USUAL = 0.75  # Up to this quantile of all `far`, any landmark is soon seen. A larger value prepares more landmarks.
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def _reconsider(m: MapState) -> tuple[bool, list[_SecondObject]]:
     if named.any():
         number, fits = np.bincount(row, minlength=len(landmarks)), np.bincount(row[support], minlength=len(landmarks))
         if m.settings.association.method == "auto":
-            # The path of a session bends more than a solve of the whole drive, which can still judge the label again.
+            # The path of a session bends more than that of the whole drive. A solve of the drive can judge the label again.
             judged = m.kinds.is_confirmed(landmarks.label) & (len(rays.owner) <= m.settings.live.reassociate)
             second = _second_objects(m, obs, held, row, support, named & ~judged)
         for one in second:

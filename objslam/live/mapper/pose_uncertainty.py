@@ -9,8 +9,8 @@ from objslam.core.rotation import skew
 
 HORIZON = 0.06
 """The heading drift (rad, one sigma) since a landmark's last observation above which the landmark is long unseen. This drift
-moves a landmark at 5 m by 0.3 m, perhaps onto a neighbour. With a larger value, single boxes match landmarks after a longer
-absence."""
+moves a landmark at 5 m by 0.3 m, perhaps to the place of a neighbour. With a larger value, single boxes match landmarks
+after a longer absence."""
 _PLACED = 0.1  # The sigma (m) of the camera position below which long unseen tracks match. A larger value matches more.
 
 

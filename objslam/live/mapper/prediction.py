@@ -12,8 +12,8 @@ from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
 
 _ASK = 10
-"""The number of keyframes after which the covariance of the pose is read from the graph again, which is slow. In between,
-odometry noise is added, so the covariance is too large. With a larger number, the covariance becomes larger."""
+"""The number of keyframes after which the covariance of the pose is read from the graph again. This read is slow. Between
+two reads, odometry noise is added, so the covariance is too large, and larger with a larger number."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class PosePredictor:
         back = adjoint(camera_T_start @ k.start_T_base[before] @ k.base_T_camera[before])
         pose = back @ self.covariance_of(number) @ back.T + covariance
         uncertainty, map_T_camera = PoseUncertainty(placed.drift, camera_from_drift, pose), m.graph.pose(number) @ motion
-        # After a way without keyframes, the localisation is better than the odometry since the last keyframe.
+        # If the robot drove far without keyframes, the localisation beats the odometry since the last keyframe.
         if held and not uncertainty.is_placed and (near := m.course.by_localization(stamp, placed.piece)) is not None:
             spread = variance + camera_from_drift @ near[1] @ camera_from_drift.T
             localized = PoseUncertainty(placed.drift, camera_from_drift, spread)

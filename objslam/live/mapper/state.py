@@ -61,7 +61,7 @@ class PairEvidence:
     """What frames say about pairs of landmarks of one label. A key holds the two ids, the smaller one first.
 
     together: the number of frames that showed both landmarks. apart: the pairs that were tested and not merged. The value of
-    a pair is the frame count of the landmark with fewer frames, divided by 5 and rounded down, at the last test. A pair is
+    a pair is from its last test: the frame count of the landmark with fewer frames, divided by 5 and rounded down. A pair is
     tested again when this value has changed.
     """
 

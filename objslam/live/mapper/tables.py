@@ -19,8 +19,8 @@ _LEAST = 0.25
 """The share of `_MOST_POSES` that is reserved for poses that no solve asks for. With a larger share, poses between old
 keyframes are closer together. This costs memory in a map with many keyframes."""
 _SUMMED = 1024
-"""The number of poses for which the travelled way is summed up at once. 1024 poses take 1 ms. All poses together, just
-before poses are dropped, would hold up one message by 50 ms. With a larger number, sums are rarer, and each sum holds up a
+"""The number of poses for which the travelled way is summed up at once. 1024 poses take 1 ms. A sum over all poses, just
+before poses are dropped, would delay one message by 50 ms. With a larger number, sums are rarer, and each sum delays a
 message for longer."""
 _FIRST = 64  # The rows that a new table has room for. More rows cost memory, fewer rows cost copies in a young session.
 
@@ -82,9 +82,9 @@ class PathTable(GrowingTable):
     """The poses of a path in the order of their stamps, as the robot sent them.
 
     Above _MOST_POSES, poses at even intervals are kept and the others are dropped. So the memory of a session of months is
-    bounded. This makes no new gap near the stamps that a later solve asks for. Elsewhere, any time may lie between two kept
-    poses. The distance and the turn that the robot travelled between kept poses are kept, because the drift of the odometry
-    grows with them.
+    bounded. No new gap appears near the stamps that a later solve asks for. Elsewhere, any time may lie between two kept
+    poses. The travelled distance and turn between kept poses are also kept, because the drift of the odometry grows with
+    both.
 
     max_gap: s, the shortest time between two poses that is a gap. reach: s, the longest time between a stamp that a solve
     asks for and the poses that it takes. newest: s, the time before the end of the path in which a solve may still ask for

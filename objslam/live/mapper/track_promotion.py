@@ -19,7 +19,7 @@ AGREE = 0.7  # The share of a track's rays that must be inliers. A larger share 
 SLACK = 0.02  # The assumed error (m) between camera poses of one track. With a larger error, more rays are inliers.
 _AGREE_BY_LABEL = 0.5  # Like `AGREE`, for tracks grouped by label alone. A larger share makes landmarks later.
 _AGAIN = 1.2  # The growth of a track's rays or spread before it is tried again. A smaller factor costs time.
-_EARLY = 0.4  # This share of joint.min_parallax_deg suffices if the position is certain. A larger share delays landmarks.
+_EARLY = 0.4  # If the position is certain, this share of joint.min_parallax_deg is enough. A larger share delays landmarks.
 _SURE = 0.05  # The sigma, as a share of the distance, below which a position is certain. A larger share accepts more errors.
 _MOST_TRACKS = 150  # The most tracks. Each track is predicted and matched in every frame, so more tracks take longer.
 

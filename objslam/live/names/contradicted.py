@@ -1,4 +1,4 @@
-"""Finds names that boxes contradict. Many boxes of such a label do not fit its landmark."""
+"""Finds names that boxes contradict: many boxes of the label do not fit its landmark."""
 
 import numpy as np
 

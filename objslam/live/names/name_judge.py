@@ -2,7 +2,7 @@
 
 The label of a person who walks is taken for a name at first. So is the label of two cups that no frame shows together. The
 rays of such labels bend the path of a session, and then the rays of true names disagree as well. Only a solve of the whole
-drive without the labels whose rays scatter shows which labels are names. The labels whose rays agree stay names.
+drive shows which labels are names. This solve leaves out labels whose rays scatter. The labels whose rays agree stay names.
 """
 
 from __future__ import annotations

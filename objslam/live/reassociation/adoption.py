@@ -15,8 +15,8 @@ from objslam.live.mapper.state import MapState
 from objslam.sources.journal.corrections import AssociationMessage
 
 _GONE = 0.1
-"""The largest share of a landmark's rays that the association may give to objects if the landmark is to leave the map. Such
-landmarks come from things that move and from false boxes. A larger share drops more landmarks."""
+"""A landmark leaves the map if the association gives at most this share of its rays to objects. Such landmarks come from
+things that move and from false boxes. A larger share drops more landmarks."""
 _LATER = -2  # The index of a ray that the association does not know. The index of a ray without an object is -1.
 
 

@@ -2,8 +2,8 @@
 
 A session decides for each frame which box belongs to which object. Some decisions turn out to be wrong later. A thing that
 comes back into view after a long drive is a new object, until the path is known well enough. A robot that turns sees a thing
-for a second, and sees it again minutes later from another place. No single view gives a position, and the tracks of the two
-views do not meet before the path is right. The offline association corrects all these errors, because it solves the whole
+for a second, and sees it again minutes later from another place. Neither view alone gives a position, and the tracks of the
+two views do not meet until the path is right. The offline association corrects all these errors, because it solves the whole
 drive.
 """
 
@@ -37,8 +37,8 @@ _DELAY = 0.1
 """The share by which the number of keyframes grows between the start of a round and the correction of the map. A larger
 share suits slower machines, but corrects the map later."""
 _KNOWN = 0.5
-"""The least share of an object's rays that belong to landmarks of the session if the object is already in the map. Any other
-object enters the map only if its position is reliable. A larger share keeps more objects out."""
+"""An object is already in the map if at least this share of its rays belong to landmarks of the session. Any other object
+enters the map only if its position is reliable. A larger share keeps more objects out."""
 _RIGHT = 0.5
 """The least share of the rays of all landmarks that an association must give to objects to take effect. With a smaller
 share, a wrong solve may spoil the map. With a larger share, walking people stay landmarks in places with many people. Four

@@ -48,7 +48,7 @@ class DetectorWorker:
         """Take an image message without blocking. stamp: s."""
         with self._ready:
             ended = self._ended
-            # The newer image takes the older image's place in the queue. At the end of the queue it might never be next.
+            # The newer image takes the older image's place in the queue. If it went to the end, it might never be next.
             late = self._waiting.get(topic)
             full = late is None and len(self._waiting) >= _MAX_TOPICS
             if not full and not ended:

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 from objslam.sources.journal.records import PathKind
 
-_SURE = 5  # The poses in a row older than the path that show a clock set back. A larger number is surer but slower.
-_BACK = 0.5  # A pose that is older than the path by less, s, is only late. A larger value ignores larger steps back.
+_SURE = 5  # This many poses in a row older than the path show a clock set back. A larger number is surer but slower.
+_BACK = 0.5  # A pose that is older than the path by less than this, s, is only late. A larger value ignores larger steps.
 _KEPT = 8  # The earlier shifts kept for stamps from before the clock changed. More shifts only cost memory.
 _MISSED = 0.005  # The assumed time, s, between the poses before and after a step back: one period at 200 Hz.
 

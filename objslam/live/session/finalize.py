@@ -223,7 +223,7 @@ def _solve_joint(found: Collected, settings: Settings, ledger: Ledger) -> Soluti
         return Solution(*measured, association, estimate, (), errors=errors)
 
     def cost(solution: Solution) -> float:
-        """Return the cost with the noise of the settings, because each solve may have found another noise."""
+        """Return the cost at the noise of the settings, because each of the two solves may have found another noise."""
         estimate = solution.estimate
         measured = keyframes, rays, settings
         if errors is not None:

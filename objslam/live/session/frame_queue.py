@@ -40,7 +40,7 @@ class FrameQueue:
         # For each frame: the corrected stamp, s, its number in the order of arrival, the message, the time of arrival, s.
         self._waiting: list[tuple[float, int, FrameMessage, float]] = []
         self._frames = 0
-        self._newest = -np.inf  # The latest arrival of a message, s. Another message may have been taken last.
+        self._newest = -np.inf  # The latest arrival of a message, s. The message taken last may have arrived earlier.
         self.lag = 0.0
         self.worked = -np.inf
 

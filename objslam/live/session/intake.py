@@ -37,8 +37,8 @@ _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A lar
 _POSES = 10_000  # The poses per path that are kept to notice repeats. A larger number costs 0.3 kB of memory per pose.
 _SAME_POSE = 1e-9  # Poses of one stamp that differ by less, m, are one pose. The value only allows for rounding.
 _WAIT = 2.0
-"""The lead of a stamp over the path, s, above which the stamp may be from before a change of the clock. Earlier shifts are
-then tried for this stamp. A larger value misses more such stamps."""
+"""A stamp that leads the path by more than this, s, may be from before a change of the clock. Earlier shifts are then tried
+for this stamp. A larger value misses more stamps from before a change."""
 _AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.
 _ALONE = "with a stamp far ahead, which the next ones did not confirm"
 _KINDS = {CameraMessage: "cameras", MountMessage: "mounts", FrameMessage: "frames", NoteMessage: "notes"}
@@ -272,7 +272,7 @@ class Intake:
     def _is_known(self, path: PathKind, at: float, pose: Floats) -> bool:
         """Return whether the session accepted the same pose before at the stamp `at` (s, session time).
 
-        The newest pose counts as not known, unless it is from an earlier session that this session resumes.
+        A match with the newest pose does not count, unless this pose is from an earlier session that this session resumes.
         """
         known = self._heard[path].get(at) if path in self._heard else None
         if known is None or (at >= self._last[path].stamp and at > self._resumed_path.get(path, -math.inf)):

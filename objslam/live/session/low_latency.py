@@ -12,8 +12,8 @@ raises the size up to 32 MB when a larger block is freed, and then keeps the mem
 more memory, and saves time."""
 _M_MMAP_THRESHOLD = -3  # The name of this limit in glibc's malloc.h.
 _SOON = 2
-"""The number of smaller garbage collections before a full one in which the full one may run early. A larger number collects
-more often. With a smaller number, more full collections come while a frame is being mapped."""
+"""A full garbage collection may run early if at most this number of smaller collections would come before it. A larger
+number collects more often. With a smaller number, more full collections come while a frame is being mapped."""
 
 
 def configure() -> None:
@@ -29,8 +29,8 @@ def configure() -> None:
 
 
 def collect_early() -> None:
-    """Run a full garbage collection now if one is soon due. It takes 20 ms, and may otherwise come while a frame is being
-    mapped.
+    """Run a full garbage collection now if one is soon due. A collection takes 20 ms, and could otherwise come while a frame
+    is being mapped.
 
     Call this function when no message waits. Without `configure`, it does nothing, and Python alone decides.
     """

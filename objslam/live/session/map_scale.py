@@ -13,8 +13,9 @@ def scale_sigma(m: MapState) -> float:
     """Return the standard deviation of the scale of the map, as a share. It is 0 if the scale is known, or not estimated.
 
     If the odometry's metre is too long or too short, so are all distances of the map. The graph takes this metre as exact.
-    With a localisation or a prior map, the metre is known. Else the calibration that last corrected the map gives its
-    uncertainty, or the calibration file. Without either, the priors of the odometry and of the ranges give it.
+    With a localisation or a prior map, the metre is known. Otherwise, the calibration that last corrected the map gives the
+    uncertainty of the metre, or the calibration file does. Without either, the priors of the odometry and of the ranges give
+    it.
     """
     if m.keyframes.localized.any() or map_T_graph(m.graph) is not None:
         return 0.0

@@ -53,7 +53,7 @@ class Describer:
         found: dict[int, tuple[tuple[int, float, bool], MapObject]] = {}
         against, widest = contradicted(m), None
         described_at = np.array([known[j][0][1] if j in known else -np.inf for j in landmarks.id.tolist()])
-        order = np.lexsort((-landmarks.id, described_at))  # Of new landmarks, the newest first. Their path error is largest.
+        order = np.lexsort((-landmarks.id, described_at))  # New landmarks come newest first, as their path error is largest.
         for row in order.tolist():
             j = int(landmarks.id[row])
             sure = not against[row]

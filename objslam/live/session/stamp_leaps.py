@@ -15,8 +15,8 @@ _LAG = 0.3
 """The lead, s, below which a stamp is no leap. This covers the usual lags between topics. With a larger value, a wrong stamp
 can move the clock further, and fewer messages wait after short pauses."""
 _STEPS = 3.0
-"""The lead, in usual steps of the stream, up to which a stamp is no leap. A larger value acts on slow streams like a larger
-`_LAG`."""
+"""The lead, in usual steps of the stream, up to which a stamp is no leap. For slow streams, a larger value has the same
+effect as a larger `_LAG`."""
 _KEPT = 8  # The number of last steps whose median is the usual step. With a larger number, a new rate is learned later.
 _APART = 60.0
 """The longest step, s, between messages that confirm each other. It is also the longest step that is no leap in a stream

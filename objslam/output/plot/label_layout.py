@@ -12,12 +12,12 @@ _DOT = 6.0  # Half the side, px, of the square around a dot that no label covers
 _PAD = 2.0  # The least distance, px, between two labels.
 _CROWDED = 60.0  # The distance, px, within which dots count as crowded. Labels of the most crowded dots are placed first.
 _FAR = 14.0  # The largest distance of a label from its dot without a leader line, px.
-_AMBIGUOUS = 2.0  # The least distance, px, by which other dots must be farther than the label's own dot, or it is ambiguous.
+_AMBIGUOUS = 2.0  # A label is ambiguous if another dot is less than this, px, farther away than its own dot.
 _AMBIGUOUS_COST = 60.0  # The cost, px, of an ambiguous label. With a larger cost, fewer labels are ambiguous.
 _COVER_COST = 1.5  # The cost, px, of each point in `avoid` that a label covers.
 _MOST_COVERED = 20  # The largest number of covered points that add to the cost.
 _CROSSING_COST = 60.0  # The cost, px, of each line, label or dot that a leader line crosses.
-_OUTWARD_GAIN = 0.05  # The cost that is saved, px, for each px away from the mean of all dots. This keeps the middle free.
+_OUTWARD_GAIN = 0.05  # The reduction of the cost, px, for each px away from the mean of all dots. It keeps the middle free.
 
 
 def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -> tuple[Floats, Bools]:

@@ -21,15 +21,15 @@ _MAX_RAYS = 2000  # The largest number of used rays in the picture. More rays wo
 _MAX_REJECTED = 400  # The largest number of rejected rays in the picture. It is small, because they cross the whole map.
 _MAX_LABELS = 150  # The largest number of labels in the picture. The objects with the most rays come first.
 _PATH_POINTS = 1500  # The largest number of points of the path that labels avoid.
-_WEIGHT = 5  # The cost for a label to cover a point of a cross or an ellipse, as a multiple of that for a point of the path.
+_WEIGHT = 5  # The cost of a covered point of a cross or an ellipse, as a multiple of the cost of a point of the path.
 _CROSS = 17.0  # The width and height of the cross of a true object, px.
 _DOT, _START = 11.0, 15.0  # The diameters of the dot of an object, and of the circle at the start of the path, px.
 _ELLIPSE_POINTS = 96  # The number of points of a drawn ellipse, which labels avoid. With fewer points, labels fit between.
 _LONG_SIDE, _SHORT_SIDE = 1350.0, 600.0  # The longer side of the map, and its least width, px. Its least height is 300 px.
 _GROWTH = 0.4
-"""The largest widening of the shown area by ellipses on each side, as a share of its longer side. The edge of the picture
-cuts off larger ellipses. A larger share shows more of large ellipses, and shrinks the rest of the map. At 0.4, the ellipse
-of a cup is whole after a drive of 1 m past the cup, and no ellipse shrinks the rest to less than half."""
+"""Ellipses may widen the shown area on each side by at most this share of its longer side. The edge of the picture cuts off
+larger ellipses. A larger share shows more of large ellipses, and shrinks the rest of the map. At 0.4, the ellipse of a cup
+is whole after a drive of 1 m past the cup, and no ellipse shrinks the rest to less than half."""
 _EDGE = 0.985  # The place of a far object's triangle, as a share of the way from the picture's centre to its edge.
 _TRIANGLE = 18.0  # The length of the triangle of a far object, px.
 _PATH, _BAND = 2.0, 1.0  # The widths, px, of a path, and of the outlines of a body that is 2 sigma smaller or larger.

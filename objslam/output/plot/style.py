@@ -35,12 +35,12 @@ _NAMED_HUES = {
 """The hue, from 0 to `_HUES` - 1, of each colour word in labels. A red buoy in blue would mislead the reader."""
 _SATURATION = 0.85  # The saturation of the colours of labels, in [0, 1].
 _LUMINANCES = (0.09, 0.17)
-"""The relative luminances of colours, in [0, 1]. Neighbouring hues have different ones, so that many colours stay distinct.
-Text in either luminance has a contrast of at least 4.5 on white (WCAG 2.1)."""
+"""The relative luminances of colours, in [0, 1]. Neighbouring hues have different luminances, so that many colours stay
+distinct. Text in either luminance has a contrast of at least 4.5 on white (WCAG 2.1)."""
 _CORE, _AROUND = 0.1, 1.5
 """The limits of the shown area of a map without a path. The box of the objects leaves out the share `_CORE` of the objects
-on each side. A picture shows all objects up to `_AROUND` times the box's diagonal away from the box, or farther if `_FENCE`
-gives a larger distance. A larger `_CORE` hides more far objects. A larger `_AROUND` hides fewer far objects."""
+on each side. A picture shows all objects whose distance from the box is at most `_AROUND` times its diagonal, or more if
+`_FENCE` gives a larger distance. A larger `_CORE` hides more far objects. A larger `_AROUND` hides fewer far objects."""
 _KNOWN_HEADING, _LONGER = np.radians(15), 2.0
 """The limits for a cuboid that is drawn with corners. The standard deviation of its yaw must be below `_KNOWN_HEADING`
 (rad). Its length must exceed its width by more than `_LONGER` standard deviations of the difference. With 15 degrees, an

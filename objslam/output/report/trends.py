@@ -18,8 +18,8 @@ and more noise."""
 _FEWEST = 15
 """The least number of rays for a point. More rays make curves smoother. With 15, the error of a median is about 20 %."""
 _HONEST = float(np.sqrt(2 * np.log(2)))
-"""The expected median residual in standard deviations along one axis. The error has two axes, so it is the median of the
-Rayleigh distribution. If the median residual is larger, the noise is larger than in the settings."""
+"""The expected median residual in standard deviations along one axis. The error has two axes, so the expected value is the
+median of the Rayleigh distribution. If the median residual is larger, the noise is larger than in the settings."""
 
 
 @dataclass(frozen=True)

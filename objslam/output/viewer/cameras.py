@@ -23,7 +23,7 @@ from objslam.output.viewer.view_point import label_rows
 _BLOCK = 500_000  # The number of pairs of an object and an image tested at once. A larger value takes more memory.
 _NEAR = 0.2  # The least distance, m, at which a camera is expected to see an object.
 _BEYOND = 1.2  # The largest distance at which an object is expected in view, as a multiple of its longest used ray.
-_LIGHTER = 0.35  # The share of white, in [0, 1], that is mixed into colours for images. They are made for a white page.
+_LIGHTER = 0.35  # The share of white, in [0, 1], mixed into colours for images. The colours are made for white pages.
 _FRUSTUM = 0.05  # The depth of a frustum, as a share of the map's size.
 
 
