@@ -76,7 +76,8 @@ class Expected:
 
     residual: (P, 3), two components across the ray (rad), and one for the range (m), which is 0 without a range. by_pose,
     by_landmark: (P, 3, 3) the Jacobians of the expected ray. variance: (P, 3) the variances of the measurements. Without a
-    range, the last variance is 1 / (2 pi), so that it multiplies the likelihood by 1. ranged: (P,) whether there is a range.
+    range, the last variance is 1 / (2 pi), so that this component multiplies the likelihood by 1. ranged: (P,) whether there
+    is a range.
     """
 
     landmark: Ints

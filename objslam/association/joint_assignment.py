@@ -109,7 +109,7 @@ def _best(pairings: Pairings, odds: Floats, allowed: Bools) -> tuple[Ints, float
         if tried[seed]:
             continue
         chosen, total = _grow(pairings, odds, allowed, seed)
-        tried[chosen] = True  # From these pairings, nearly the same hypothesis would grow.
+        tried[chosen] = True  # From the chosen pairings, nearly the same hypothesis would grow again.
         if total > most:
             best, most = chosen, total
     return best, most

@@ -285,7 +285,7 @@ def _whole_boxes(obs: Observations, view: CameraFrames) -> Bools:
     """Return which cameras (C,) have boxes that go around whole objects, even if the image's edge cuts an object off.
 
     Such boxes reach beyond the image. A detector of the poses of objects draws them, for example. It should find an object
-    wherever its centre is in the image. A few boxes beyond the edge are not enough: any detector may draw them.
+    wherever its centre is in the image. A few boxes beyond the edge are not enough, because any detector may draw a few.
     """
     sizes = np.array([camera.size for camera in view.cameras]).reshape(-1, 2)
     camera, low, high = view.camera[obs.frame], obs.box[:, :2], obs.box[:, 2:]

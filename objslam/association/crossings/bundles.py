@@ -86,7 +86,7 @@ def second_bundle(
 ) -> Bools:
     """Return which rays (R,) are beyond the widest gap between the directions of their object's rays.
 
-    The gap is searched along the line on which the directions spread most. An object without a gap has no such rays.
+    The gap is searched along the line on which the directions spread most. For an object without a gap, no ray is beyond.
 
     Args:
         direction: (R, 3) unit, of the rays in map.

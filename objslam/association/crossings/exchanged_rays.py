@@ -24,8 +24,8 @@ def annealed(state: State, gate: float, settle: Callable[[State], State]) -> Sta
     """Assign the rays of close landmarks again, first by their appearance and then more and more by their position.
 
     Two close landmarks may have exchanged some rays. Then both landmarks lie between the objects, and no single ray fits the
-    other landmark better. If the noise of the rays is assumed larger than it is, the appearance decides (deterministic
-    annealing, Rose 1998). Each label keeps its earlier landmarks if the new ones explain its rays no better.
+    other landmark better. If the assumed noise of the rays is larger than the real noise, the appearance decides
+    (deterministic annealing, Rose 1998). Each label keeps its earlier landmarks if the new ones explain its rays no better.
     """
     obs, begin = state.obs, learned(state)
     if begin.ratio is None:

@@ -1,8 +1,8 @@
 """Replace two landmarks at crossings by the two things whose rays cross there.
 
 Seen from two stretches of the path, two things of one label have four points where rays meet: the things, and two ghosts.
-The rays of each ghost come from both things. Both ghosts together have as many rays as both things together. The rays from
-a short part of the path fit the ghosts well. So no ray of one ghost fits the other ghost better. A search that takes the
+The rays of each ghost come from both things. Both ghosts together have as many rays as both things together. The rays from a
+short part of the path fit the ghosts well. So no ray of one ghost fits the other ghost better. A search that finds the
 points one by one may find the ghosts first. Only rays from a third side reveal the ghosts. Such rays fit both ghosts worse
 than the rays of other landmarks fit their own landmarks.
 """

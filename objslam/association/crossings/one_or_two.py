@@ -27,8 +27,8 @@ _GAP = np.radians(2.0)
 more landmarks."""
 _HIDDEN, _HIDDEN_WIDTH = 0.1, 4.6
 """`_HIDDEN` is the assumed share of views that show only a part of a thing. Their ln size has a uniform distribution of the
-width `_HIDDEN_WIDTH`: a factor of 100 between the smallest and the largest size. With a larger share, or a smaller width,
-different sizes count less."""
+width `_HIDDEN_WIDTH`: a factor of 100 between the smallest and the largest size. With a larger share, or a smaller width, a
+difference of sizes is weaker evidence."""
 _CLEAR = 3.0
 """The least log odds of two things over one for a landmark that is split: 3 is a factor of 20. A larger value splits fewer
 landmarks. A thing may be lost if it is split."""
@@ -36,7 +36,7 @@ _ASSUMED = 3
 """The number of landmarks that are assumed to have the usual gain (`_USUAL_GAIN`), in addition to the landmarks of the log.
 With a larger number, errors that rays share split more landmarks."""
 _LEAST_EXCESS = 1 / 16
-"""The least factor on the usual gain of two points. Rays with a quarter of the nominal noise have this factor. A smaller
+"""The least factor on the usual gain of two points. Rays with a quarter of their nominal noise have this factor. A smaller
 factor splits more landmarks."""
 _OFF_CENTRE = 0.02
 """The offset between the middle of a thing and the middles of its boxes in one bundle, as a share of the boxes' size.
@@ -109,7 +109,7 @@ def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
     ray = state.assigned[np.isin(state.owner, two)]
     group = 2 * np.searchsorted(two, state.matched[ray]) + second[ray]
     number, landmark = np.bincount(group, minlength=2 * len(two)), np.repeat(two, 2)
-    # This is the noise of the class, because a landmark that is two things has much noise of its own.
+    # The noise of the class counts, because the own noise of a landmark that is two things is too large.
     noise = state.class_noise[state.label[landmark]]
     bundles = Bundles(UsualViews.of(state, sized), ray, group, landmark, noise, np.minimum(number, COUNTED))
     one, one_cost = _as_one(bundles)
@@ -119,7 +119,7 @@ def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
     two_things = _as_two((_most(bundles, free), free_cost), (other, other_cost))
     odds = one - (two_things[0] + _bearing_odds(one_cost - two_things[1], excess, len(two))).max(axis=0)
     position, open_ = free.position.copy(), np.flatnonzero(odds < 0)
-    if len(open_):  # Only these can be two things. Trying all distances takes most of the time.
+    if len(open_):  # Only `open_` can be two things. The trial of all distances takes most of the time.
         pair = (2 * open_[:, None] + np.arange(2)).ravel()
         alone, alone_cost, position[pair] = _alone(bundles.take(pair), free.take(pair))
         two_things = _as_two((alone, alone_cost), (other[pair], other_cost[pair]))

@@ -26,8 +26,8 @@ from objslam.core.statistics import logistic
 from objslam.core.types import Association
 
 _MOVING = 6
-"""The number of coordinates of a moving point: three of its position and three of its velocity. So it explains any three
-rays."""
+"""The number of coordinates of a moving point: three of its position and three of its velocity. Such a point explains any
+three rays."""
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
 _TURNS = 8
 """The most searches among the unassigned rays. No further search follows one that finds nothing. A larger number may find
@@ -164,9 +164,9 @@ class _Few:
     def search(self, least: float, seed: int) -> tuple["_Few", State]:
         """Return the landmarks of the free rays whose probability to exist is not below `least`.
 
-        The landmarks show the errors of the places from which they were seen. Without these errors, a landmark may turn out
-        to be several things. So the errors are removed, and the search is repeated. Also return the search from the
-        corrected places.
+        The landmarks show the errors of the places from which they were seen. After a correction of these errors, a landmark
+        may turn out to be several things. So the errors are corrected, and the search is repeated. Also return the search
+        from the corrected places.
         """
         obs = self.known.obs
         if not obs.position_sigma:

@@ -2,7 +2,7 @@
 
 The matrix is an arrow: a block of 3 x 3 for each object, a block of w x w for each map, and blocks between an object and the
 maps that measured it. The unknowns of the objects or those of the maps can be eliminated first (Schur complement). The
-result is the same. Here, the kind with more unknowns is eliminated. So with few maps, the time grows with the number of
+result is the same. This module eliminates the kind with more unknowns. With few maps, the time grows with the number of
 objects. With few objects, the time grows with the number of maps.
 """
 

@@ -40,11 +40,11 @@ _AGAIN = 0.01
 of nearly exact objects would fix the shared errors. A larger value trusts small distances in maps less."""
 _SQUARES = 2 * gammaincinv(1.5, (np.arange(50) + 0.5) / 50)
 """Squared lengths of normal residuals (chi-squared, 3 degrees of freedom) at equal steps of probability. The mean over them
-gives the expectation of a weighted squared residual. More steps give it more exactly."""
+gives the expectation of a weighted squared residual. More steps give this expectation more exactly."""
 _STILL = 1e-6
 """The largest step (m, rad) that ends the solve. A larger value ends it sooner. With Cauchy's weights, each step is about
-half of the previous step. So at the end the positions are wrong by about this much, which is a thousandth of the errors of
-the best maps."""
+half of the previous step. So at the end the positions are wrong by about the length of this step, which is a thousandth of
+the errors of the best maps."""
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,8 @@ objects nearest to its pair. The second number is how many of the best proposals
 overlaps and take longer."""
 _LIMITS = (SAME_POINT, SAME_POINT / 2)
 """The largest squared Mahalanobis distances of a match. Matches are counted once with each limit, and the count with the
-most evidence is used. The first limit holds 99 % of true matches, the second 87 %. With tighter limits, simulated groups of
-three equal objects gave false alarms more often than the log odds say."""
+most evidence is used. The first limit accepts 99 % of true matches, and the second limit accepts 87 %. With tighter limits,
+simulated groups of three equal objects gave false alarms more often than the log odds say."""
 _FITS = 2
 """The number of rounds of matching and fitting in each stage. A larger number takes longer."""
 _SAME_SHIFT, _SAME_TURN = 0.5, 0.1

@@ -24,9 +24,9 @@ _MISSES = 1.5
 variance is unexplained. A larger value gives fewer warnings."""
 _CUT, _CUT_NAMED = 1 / 2, 1 / 3
 """A result needs a look if the image's edge cuts off more than the share `_CUT` of the boxes: the map then lacks most of
-what the detector saw. From the share `_CUT_NAMED` on, the assessment names the share. A tenth is usual in the demo's rooms.
-A third is usual in homes, where a robot passes things closely. Dropped boxes bend no map. Larger values give fewer
-warnings."""
+what the detector saw. From the share `_CUT_NAMED` on, the assessment names the share. A share of a tenth is usual in the
+demo's rooms, and of a third in homes, where a robot passes things closely. Dropped boxes bend no map. Larger values give
+fewer warnings."""
 _OFF_PATH = 1 / 3
 """A result needs a look if more than this share of the boxes have no pose of the robot. Recordings often begin before the
 localisation, and end after it. A larger value gives fewer warnings."""
@@ -36,7 +36,7 @@ because of false boxes and moving things. A larger value gives fewer warnings.""
 _LOOSE = 9.0
 """A result needs a look if the noise of the odometry is this multiple of the settings, or more. Right maps of recorded
 robots have up to 8.1. If the multiple is larger, the fault is often not in the odometry: a camera that turns on the robot
-looks the same. A larger value gives fewer warnings."""
+causes the same noise. A larger value gives fewer warnings."""
 _LOOSE_POSES = 9.0
 """A result of the joint mode needs a look if the noise of the localisation is this multiple of the settings, or more.
 Simulated robots with AMCL or a scan matcher have up to 5.3. Wrong maps of rows of pallets that hide each other, which bent
@@ -51,8 +51,8 @@ multiple of the settings. Right maps of simulated robots have at most 1.7. Wrong
 1.9 and 3.3. Wrong maps of recorded robots have 5 and more. With ranges, a right map of a recorded robot has 5.0. A larger
 value gives fewer warnings."""
 _FEW = 60
-"""A result needs a look if it has fewer rays than this. The checks of the input do not judge fewer boxes. A larger value
-gives more warnings."""
+"""A result needs a look if it has fewer rays than this number. With fewer boxes, the checks of the input give no verdict. A
+larger value gives more warnings."""
 
 
 _MALFORMED = 0.05

@@ -16,7 +16,7 @@ _FEWEST = 20
 larger number judges fewer logs."""
 _PART = 0.9
 """If more than this share of the boxes has no coordinate above 1.5, the boxes are probably shares of the image, not px. A
-smaller share also reports logs in which only some boxes are so small."""
+smaller share also reports logs in which only some boxes have such small coordinates."""
 _WITHOUT_AREA = 0.2
 """If more than this share of the boxes has no area, the corners are not x1 y1 x2 y2. No detector writes such boxes. A larger
 share warns less often."""

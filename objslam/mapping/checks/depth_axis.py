@@ -32,9 +32,9 @@ def check_depth_axis(
 ) -> Finding | None:
     """Return a finding if the depths of a solved map grow or shrink with the cosine of the angle from the optical axis.
 
-    A depth image holds distances along the optical axis. A laser or a person measures distances along the ray. If one is
-    taken for the other, depths near the edge of the image are wrong by the factor cosine: 13 % at 30 degrees. The fitted
-    model is log(range / distance) = power * log(cosine) + constant, with one constant for each object. The constant takes up
+    A depth image holds distances along the optical axis. A laser or a person measures distances along the ray. If the two
+    kinds are confused, depths near the edge of the image are wrong by the factor cosine: 13 % at 30 degrees. The fitted
+    model is log(range / distance) = power * log(cosine) + constant, with one constant for each object. The constant absorbs
     the scale of the map, and errors that all depths of an object share.
 
     map_T_camera: (K, 4, 4) the solved poses of the cameras at the keyframes.

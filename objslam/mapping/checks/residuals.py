@@ -101,7 +101,7 @@ def check_residuals(
     are ok count.
 
     residual: (R,) rad between each ray and its object. calibrated: whether the cameras were calibrated against the poses.
-    All rays of an object count, also rejected ones. Rays of one keyframe share its pose error, so they count as one.
+    All rays of an object count, also rejected rays. Rays of one keyframe share its pose error, so they count as one ray.
     """
     held = held_rays(objects, association)
     if not held.any():

@@ -30,7 +30,7 @@ _LEAST_GAIN = 40.0
 value finds fewer errors."""
 _LEAST_SHARE = 0.04
 """The least decrease of the sum of the squared deviations by an error that counts, as a share of the sum. Rays of a real log
-are not independent, so the sum of many small deviations proves nothing. A larger value finds fewer errors."""
+are not independent, so a decrease that is a small share of a large sum proves nothing. A larger value finds fewer errors."""
 _UNUSUAL = 4.0
 """An error is unusual if it exceeds this number of prior standard deviations. A larger number calls fewer errors unusual."""
 _ROUNDS = 6

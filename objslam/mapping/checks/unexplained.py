@@ -14,9 +14,9 @@ _IMPLAUSIBLE = 0.4
 mirrored images or boxes of another image size have at least 0.5. A larger share warns less often."""
 _FITS, _ENOUGH = 0.2, 0.3
 """The limits for the verdict that the input is right, but some labels do not fit. At most the share `_FITS` of the boxes of
-the other labels has no object, and these labels have at least the share `_ENOUGH` of all boxes. In a simulated classroom,
-0.87 of the boxes of desks and 0.15 of the others had no object. A larger `_FITS`, or a smaller `_ENOUGH`, doubts the input
-less often."""
+the other labels has no object, and the other labels have at least the share `_ENOUGH` of all boxes. In a simulated
+classroom, 0.87 of the boxes of desks and 0.15 of the others had no object. A larger `_FITS`, or a smaller `_ENOUGH`, doubts
+the input less often."""
 _INPUT = "the stamps, base_T_camera, the axes of the poses, and that boxes are x1 y1 x2 y2 in px of this image size"
 
 

@@ -16,8 +16,8 @@ from objslam.mapping.doubts.points import MISSED, fit_points
 _FEWEST = 8
 """The fewest boxes of a group. A larger number finds fewer groups."""
 _BY_CHANCE = 0.1
-"""The largest share of the random boxes near a place of the image that are at the place (`robot_parts.STEADY`). A larger
-share finds fewer groups."""
+"""The largest share of the random boxes near a place of the image that are at the place itself (`robot_parts.STEADY`). A
+larger share finds fewer groups."""
 _TRIED = 64
 """The most boxes of a label and camera around which the boxes at the same place of the image are counted. A larger number
 finds smaller groups."""

@@ -107,7 +107,7 @@ def _links(evidence: Evidence, left: Ints, frame: Ints, lags: tuple[int, ...], d
         first = np.repeat(np.arange(len(left)), number)
         second = order[np.repeat(begin, number) + np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)]
         angle = _angle(direction[left[first]], direction[left[second]])
-        # Far lags measure chance, so they get the angle of a near lag.
+        # Far lags measure how often boxes follow by chance, so they get the angle of a near lag.
         seconds = (stamp[second] - stamp[first]) / lag * (lags.index(lag) + 1)
         noise = _SIGMAS * np.hypot(obs.sigma[left[first]], obs.sigma[left[second]])
         ratio = size[second] / np.maximum(size[first], 1e-9)

@@ -24,11 +24,11 @@ _LEAST = 0.1
 """The least probability that a reported pair is one object. A larger value reports fewer pairs."""
 _BOTH = 0.5
 """The share of the frames that really show both of two independent objects, among the frames that should show both. In the
-others, one thing hides another, or a detector suppresses boxes that overlap. The share is chosen, not measured. With a
+other frames, one thing hides another, or a detector suppresses boxes that overlap. The share is chosen, not measured. With a
 larger share, a frame without both is stronger evidence for one object."""
 _BESIDES = 0.2
-"""The number of frames that show both objects by chance, whether they are one or two. It keeps the odds from few frames
-finite. With a larger number, a few frames count less."""
+"""The number of frames that show both objects by chance, whether they are one or two. This number keeps the odds from few
+frames finite. With a larger number, a few frames count less."""
 _PAD = 1.0
 """The margin (m) around the objects in which other objects of their label may lie. With a larger margin, fewer pairs are
 expected to be close by chance."""

@@ -64,7 +64,7 @@ def find_splits(evidence: Evidence) -> Splits:
     to = state.landmarks.position[owner] - obs.origin[ray]
     depth = np.einsum("pi,pi->p", to, obs.direction[ray])
     offset = depth[:, None] * obs.direction[ray] - to
-    # The noise of the label, because an object that is two has much noise of its own.
+    # The noise of the label counts, because the own noise of an object that is two things is too large.
     sigma = np.sqrt(state.variance) / state.landmarks.noise[owner] * state.class_noise[state.label[owner]]
     scaled = offset / sigma[:, None]
     scaled *= np.minimum(1.0, CLIPPED_RAY / np.maximum(np.linalg.norm(scaled, axis=1), 1e-9))[:, None]

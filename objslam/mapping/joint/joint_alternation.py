@@ -343,7 +343,7 @@ class JointState:
             self.settings,
             seed=self.settings.seed,
             guess=guess,
-            # The landmarks of a solve hold the path together. Before the first solve, only the odometry does.
+            # After a solve, landmarks hold the path together. Before the first solve, only the odometry does so.
             drifts=rough and frames.odom_T_base is not None and not frames.localized_every,
             solved=not rough,
         )

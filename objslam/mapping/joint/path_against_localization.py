@@ -21,7 +21,7 @@ _SECONDS = 5.0
 """The length (s) of a piece of the path. Each piece is judged by its median distance from the localisation. Clocks and
 single jumps disturb shorter pieces. Longer pieces miss short bends."""
 _FEWEST = 3
-"""The fewest localised poses of a piece that is judged. With fewer poses, the median follows a single jump. With a larger
+"""The fewest localised poses of a piece that is judged. With fewer poses, a single jump can move the median. With a larger
 number, fewer pieces are judged."""
 _CHANCE = 1e-3
 """The probability that a right path gets a finding by chance, over all its pieces together. With a larger value, smaller

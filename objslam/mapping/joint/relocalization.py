@@ -54,7 +54,7 @@ def relocalized(begin: JointState) -> JointState:
         start = path @ state.keyframes.base_T_camera
         state = replace(state, hold=begin.hold or (begin.errors is not None and number % 2 == 1))
         state = state.counted(association).solve("association", association, start).merged()
-        # Close objects may merge in one round, and part again.
+        # Close objects may merge in one round, and separate again in a later round.
         best, worse = (state, 0) if state.explained > best.explained else (best, worse + 1)
         if worse == _WORSE or state.spent:
             break

@@ -1,8 +1,8 @@
 """Detect that somebody turned a camera on the robot in the middle of a log.
 
 All other errors of a camera are the same in both halves: its clock, its place, its lens, and the rotation that it had at
-first. They are estimated together with the turn. Otherwise they look like a turn: a late clock moves all rays to one side
-while the robot turns left, and to the other side while it turns right.
+first. They are estimated together with the turn. Otherwise, these errors look like a turn: a late clock moves all rays to
+one side while the robot turns left, and to the other side while the robot turns right.
 
 The errors of poses last for seconds, and many boxes share them. The covariance of an estimate treats the boxes as
 independent, so it is too small at the poses of a particle filter. So the estimate is repeated without each eighth of the
@@ -33,7 +33,7 @@ _TURN = 0.2
 """The prior standard deviation (rad) of a turn. With a larger value, larger turns are found."""
 _SAME = 1e-3
 """The prior standard deviation of the change of all other errors, as a share of the prior standard deviation of the errors.
-The graph divides by it, so it is not 0. A larger value lets the other errors change too."""
+The graph divides by this share, so it must not be 0. A larger value lets the other errors change too."""
 MOVED = 0.05
 """The least change of a camera's rotation (rad) between the halves of a log that shows that the camera was moved. A larger
 value warns less often."""
@@ -44,8 +44,8 @@ _SUSPECT, _SUSPECT_SIGMAS = 0.5, 2.0
 """The least change for which another round of the estimation follows: as a multiple of `MOVED`, and in standard deviations.
 In the first round, only rays that show a small change fit. Larger values take less time, and find fewer turns."""
 _BLOCKS = 8
-"""The number of pieces of time that are left out one at a time. All have equally many boxes. A piece must be longer than the
-errors of poses last. More pieces are shorter, and take longer to compute."""
+"""The number of pieces of time that are left out one at a time. All pieces have equally many boxes. A piece must be longer
+than the time for which errors of poses last. More pieces are shorter, and take longer to compute."""
 _MOVED_BY_ODOMETRY, _GAIN_BY_ODOMETRY = 0.1, 0.03
 """The value of `MOVED` (rad) for poses by odometry, and the least growth of the score (`Agreement.score`) by a turn at such
 poses. Drift looks like a rotation of the camera, and the standard deviations do not contain drift. Larger values warn less

@@ -9,8 +9,8 @@ _NEAR = 12.0
 """The largest distance (px) between the centres of two boxes at one place of the image. It exceeds the noise of boxes.
 Things that a moving camera passes move farther within `_LATER`. A larger distance takes slow motion for a stop."""
 _NEAR_SHARE = 0.1
-"""The value of `_NEAR` as a share of the mean of a box's width and height, if this is larger. The noise of a box grows with
-its size."""
+"""If this share of the mean of a box's width and height is larger than `_NEAR`, it replaces `_NEAR`. The noise of a box
+grows with its size."""
 _LATER = 2.0
 """The time (s) after which a box shows whether it moved. A longer time shows slower motions, and needs longer stops."""
 _STAYS = 0.25
