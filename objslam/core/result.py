@@ -1,6 +1,7 @@
 """The result of a run, from which every output is made. It has the map, the doubts about the map, and the surface of the
 room."""
 
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
@@ -21,6 +22,10 @@ DOUBT_KINDS: tuple[DoubtKind, ...] = ("pair", "split", "moved", "unresolved", "u
 """The kinds of doubts: two objects that may be one, an object that may be two, an object that was there for a part of the
 drive, an object without a position, an object with a wide sigma, boxes that became no object, and a label without an
 object."""
+
+
+LIKELY = 0.5
+"""The least probability of a likely doubt. With a larger value, fewer objects are doubtful, and more maps are good."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +65,12 @@ class Doubt:
             **{"kind": self.kind, "reason": self.reason, "label": self.label, "text": self.text},
             **{"objects": list(self.objects), "position": position, "numbers": numbers, "rays": self.rays.tolist()},
         }
+
+
+def doubtful_ids(doubts: Iterable[Doubt], kinds: Collection[DoubtKind]) -> set[int]:
+    """Return the ids of the objects that doubts of some kinds are about. Doubts that are not likely do not count."""
+    likely = (one for one in doubts if one.kind in kinds and one.numbers.get("probability", 1.0) >= LIKELY)
+    return {j for one in likely for j in one.objects}
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.result import DOUBT_KINDS, Doubt, RunResult
+from objslam.core.result import DOUBT_KINDS, LIKELY, Doubt, RunResult, doubtful_ids
 from objslam.core.statistics import grouped_median
 from objslam.mapping.doubts import cut_things as cut_off
 from objslam.mapping.doubts import disagreeing as apart
@@ -26,9 +26,6 @@ from objslam.mapping.moves import driven_through as passed
 from objslam.mapping.moves import other_places as moved
 from objslam.mapping.moves import temporary_things as temporary
 
-_DOUBLE = 0.5
-"""A pair of objects counts in the assessment if it is one object with at least this probability. With a larger value, more
-maps are good."""
 _DOUBTFUL = 0.4
 """The least share of doubtful objects in a bad map. A doubtful object is likely a double, or may be several things or at a
 wrong place. In simulation, two maps with mostly wrong objects had 0.44 and 0.47, and right maps had at most 0.15. A third
@@ -131,7 +128,7 @@ def with_doubts(result: RunResult) -> RunResult:
     summary = {**result.summary, "doubts": counts}
     doubtful = _doubtful_objects(doubts, result)
     summary["doubtful_objects"] = doubtful
-    doubles = int((found.pairs.probability >= _DOUBLE).sum()) + sum(_of_one_label(one, result) for one in filling)
+    doubles = int((found.pairs.probability >= LIKELY).sum()) + sum(_of_one_label(one, result) for one in filling)
     if "assessment" in summary:
         lost, named = _of_lost_things(found.groups, result), wide.in_assessment(unsure, result)
         odd = {j for one in (*disagreeing, *mixed, *through, *elsewhere) for j in one.objects}
@@ -167,7 +164,7 @@ def maps_things_twice(result: RunResult) -> bool:
     visits do not show them. Wrong poses also put whole places into the map twice (`find_twice`).
     """
     moved = [one for one in result.doubts if "moved" in (one.kind, one.reason)]
-    pairs = [one for one in result.doubts if one.kind == "pair" and one.numbers.get("probability", 0.0) >= _DOUBLE]
+    pairs = [one for one in result.doubts if one.kind == "pair" and one.numbers.get("probability", 0.0) >= LIKELY]
     doubles = {j for one in (*moved, *pairs) for j in one.objects}
     many = max(_FEWEST_DOUBTFUL, _DOUBLES * len(result.map.resolved()))
     return len(doubles) >= many or find_twice(result.map) is not None
@@ -175,8 +172,7 @@ def maps_things_twice(result: RunResult) -> bool:
 
 def _doubtful_objects(doubts: tuple[Doubt, ...], result: RunResult) -> int:
     """Return the number of objects with a position that are likely doubles, or may be several things or at a wrong place."""
-    clear = [one for one in doubts if one.numbers.get("probability", 1.0) >= _DOUBLE]
-    named = {j for one in clear if one.kind in ("pair", "split") for j in one.objects}
+    named = doubtful_ids(doubts, ("pair", "split"))
     return sum(one.id in named for one in result.map.resolved())
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats
 from objslam.core.object_map import MapObject
-from objslam.core.result import RunResult
+from objslam.core.result import RunResult, doubtful_ids
 from objslam.core.types import Truth
 from objslam.frontend.up import from_above, up_axis
 from objslam.mapping.checks.assessment import HEADLINES
@@ -40,6 +40,7 @@ _BEFORE, _AFTER = (0.541, 0.541, 0.541), (0.188, 0.204, 0.231)  # The colours of
 _TRUE = (0.180, 0.545, 0.341)  # The colour of the true path, as in the viewer.
 _NEUTRAL = (0.333, 0.333, 0.333)  # The legend shows objects in this colour, because each label has its own colour.
 _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+_DOUBT = (0.769, 0.345, 0.0)  # The rim of a doubtful object is orange, as doubts are in the viewer.
 
 
 def draw_map(result: RunResult, file: Path, truth: Truth | None = None) -> None:
@@ -78,7 +79,11 @@ def map_figure(result: RunResult, truth: Truth | None = None) -> Figure:
         shapes=(*shapes, *dots),
         legend=_legend(result),
     )
-    names = np.array([shortened(name) for name in captions(result.map)], dtype=object)
+    doubtful = _doubtful(result)
+    names = np.array(
+        [shortened(name) + " ?" * (o.id in doubtful) for o, name in zip(result.map, captions(result.map), strict=True)],
+        dtype=object,
+    )
     names[far] = [f"{name}, {away:.1f} m out" for name, away in zip(names[far], beyond, strict=True)]
     points[far] = at
     seen = [o for o, is_shown in zip(result.map, shown.tolist(), strict=True) if is_shown]
@@ -87,7 +92,7 @@ def map_figure(result: RunResult, truth: Truth | None = None) -> Figure:
     path = result.map_T_base[sample(np.ones(len(result.map_T_base), dtype=bool), _PATH_POINTS)][:, plane, 3]
     labels = _labels(figure, result, points, shown | far, names, (path, crosses, outlines))
     left_out = int((shown | far).sum()) - len(labels)
-    note = f"{left_out} labels have no room" if left_out else ""
+    note = f"{left_out} label{'s have' if left_out > 1 else ' has'} no room" if left_out else ""
     return replace(figure, labels=labels, note=note, warning=_warning(result))
 
 
@@ -138,7 +143,7 @@ def _paths(result: RunResult, truth: Truth | None, plane: list[int]) -> list[Sha
 
 def _objects(result: RunResult, plane: list[int], points: Floats) -> tuple[list[Shape], list[Shape]]:
     """Return two lists: the ellipses, outlines and dashed rays of the objects, and their dots. points: (N, 2), m."""
-    colours = label_colours(result.map)
+    colours, doubtful = label_colours(result.map), _doubtful(result)
     below: list[Shape] = []
     dots: list[Shape] = []
     for o, point in zip(result.map.objects, points, strict=True):
@@ -148,7 +153,7 @@ def _objects(result: RunResult, plane: list[int], points: Floats) -> tuple[list[
             below.append(Line(np.stack([start, point]), colour, _PATH, dashed=True))
             dots.append(Marks(point[None], "dot", _WHITE, colour, _DOT - 1, ""))
             continue
-        dots.append(Marks(point[None], "dot", colour, _WHITE, _DOT))
+        dots.append(Marks(point[None], "dot", colour, _DOUBT if o.id in doubtful else _WHITE, _DOT))
         rim = _ellipse(o, plane)
         if rim is not None:
             below.append(Area(rim, colour, 0.18))
@@ -161,6 +166,11 @@ def _objects(result: RunResult, plane: list[int], points: Floats) -> tuple[list[
             below.append(Line(o.tag.outline(o.position)[:, plane], colour, _TAG))
             below.append(Line(np.stack([o.position, o.position + _NORMAL * o.tag.rotation[:, 2]])[:, plane], colour, _PATH))
     return below, dots
+
+
+def _doubtful(result: RunResult) -> set[int]:
+    """Return the ids of the objects that may be doubles, several things, or at a wrong place."""
+    return doubtful_ids(result.doubts, ("pair", "split", "moved")) & {o.id for o in result.map.resolved()}
 
 
 def _lighter(colour: Colour) -> Colour:
@@ -180,6 +190,8 @@ def _legend(result: RunResult) -> tuple[Line | Marks, ...]:
         entries.append(Line(nowhere, _lighter(_NEUTRAL), _BAND, "2 sigma of their sizes"))
     if any(o.tag is not None for o in result.map):
         entries.append(Line(nowhere, _NEUTRAL, _TAG, "fiducials and their normals"))
+    if _doubtful(result):
+        entries.append(Marks(nowhere, "dot", _NEUTRAL, _DOUBT, _DOT, "doubtful (objslam explain)"))
     if resolved < len(result.map):
         entries.append(Marks(nowhere, "dot", _WHITE, _NEUTRAL, _DOT - 1, "unresolved"))
     return tuple(entries)

@@ -11,10 +11,12 @@ import pytest
 from synthetic_result import clusters, synthetic_result
 
 from objslam.core.arrays import Floats
+from objslam.core.result import Doubt, DoubtKind
 from objslam.output.plot.canvas import blank, draw_line, draw_segments, draw_text, text_width
 from objslam.output.plot.figure import Area, Figure, Line, Marks, Segments
-from objslam.output.plot.map_plot import draw_map, map_figure
+from objslam.output.plot.map_plot import _DOUBT, draw_map, map_figure
 from objslam.output.plot.page import FONT, wrapped
+from objslam.output.plot.style import captions
 
 
 def lines(figure: Figure) -> dict[str, Floats]:
@@ -311,6 +313,32 @@ def test_an_object_without_covariance_or_place_can_be_drawn(tmp_path: Path) -> N
     assert len(areas(map_figure(changed))) == 12
     draw_map(changed, tmp_path / "map.png")
     assert picture(tmp_path / "map.png").min() < 100
+
+
+def test_likely_doubts_mark_their_objects() -> None:
+    """An unlikely double and a wide sigma mark nothing, and neither does a doubt about an object without a position."""
+    result, _ = synthetic_result(*clusters(), keyframes=20)
+    first, second, third, *_ = (o.id for o in result.map.resolved())
+    lost = dataclasses.replace(result.map.objects[-1], status="unresolved", position=np.full(3, np.nan), covariance=None)
+    result = dataclasses.replace(result, map=dataclasses.replace(result.map, objects=(*result.map.objects[:-1], lost)))
+
+    def doubt(kind: DoubtKind, *objects: int, **numbers: float) -> Doubt:
+        return Doubt(kind, "reason", "label", "A sentence.", objects, None, np.zeros(0, dtype=np.int64), numbers)
+
+    doubts = (
+        doubt("pair", first, second, probability=0.4),
+        doubt("pair", first, lost.id, probability=0.6),
+        doubt("moved", third),
+        doubt("unsure", second),
+    )
+    figure = map_figure(dataclasses.replace(result, doubts=doubts))
+    marked = [text for text in texts(figure) if text.endswith(" ?")]
+    named = zip(result.map, captions(result.map), strict=True)
+    assert sorted(marked) == sorted(f"{name} ?" for o, name in named if o.id in (first, third))
+    orange = [one for one in figure.shapes if isinstance(one, Marks) and one.rim == _DOUBT]
+    assert len(orange) == 2
+    assert any("doubtful" in one.name for one in figure.legend)
+    assert not any("doubtful" in one.name for one in map_figure(result).legend)
 
 
 def test_of_a_great_many_objects_those_with_most_rays_are_named() -> None:
