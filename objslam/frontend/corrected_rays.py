@@ -50,7 +50,7 @@ def corrected_poses(
         return known, map_T_base, base_T_camera
     map_T_base = poses_near(localization, known.ravel(), max_gap).reshape(*known.shape, 4, 4)
     if keyframes.localized_at is not None:
-        # A session has keyframes that the odometry does not reach. It carries no pose to such a keyframe.
+        # In a session, the odometry does not reach some keyframes. The odometry carries no pose to such a keyframe.
         reached = True if keyframes.stretch is None else keyframes.stretch >= 0
         localized_at = np.where(reached, keyframes.localized_at, np.nan)
         for at, stamps, error in zip(map_T_base, known, errors, strict=True):
