@@ -75,8 +75,8 @@ def box_depth(image: NDArray[Any], box: Floats, focal: float) -> float:
 def _of_thing(depths: Floats, size: float) -> Floats:
     """Return the depths, among depths (n,), that belong to the nearest surface.
 
-    A thing may be as deep as it is wide or high. Depths behind this range are background, if a gap separates them from the
-    thing. size: the larger side of the thing, per unit of its depth.
+    A thing may be as deep as it is wide or high. Larger depths are background, if a gap separates them from the thing. size:
+    the larger side of the thing, per unit of its depth.
     """
     least = _LEAST_SHOWN * len(depths)
     while True:

@@ -16,7 +16,7 @@ from objslam.frontend.corrected_odometry import corrected_odometry
 from objslam.frontend.surface_ranges import corrected_ranges
 
 _SQUEEZED = 1e-3
-"""A clock offset may move frames beyond an end of the path. Their stamps are then squeezed into this time (s) before the
+"""A clock offset may move frames beyond an end of the path. Their stamps are then squeezed into this time (s) next to that
 end. A larger value moves more frames. With a smaller value, stamps of fast cameras become equal, because float64 resolves
 Unix time to 0.2 us."""
 _AHEAD = np.array([[0.0, 0.0, 1.0]])  # The direction along which depths are measured, in the camera frame.

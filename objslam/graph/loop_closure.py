@@ -31,8 +31,8 @@ _SLIPS = (1.0, 3.0, 10.0)
 than a Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
 _BESIDE = 0.03
 """The standard deviation (rad) that a step from a landmark to another landmark adds to the heading, if some frame showed
-both. Landmarks about 1 m apart have errors of 2 or 3 cm. With a smaller value, landmarks are recognised after longer ways
-through the map, even if parts of the map are bent."""
+both. Landmarks about 1 m apart have relative errors of 2 or 3 cm. With a smaller value, landmarks are recognised after
+longer ways through the map, even if parts of the map are bent."""
 _STEPS = 10
 """The largest number of landmarks on a way through the map from a known landmark to another. With more than ten landmarks,
 the variance is larger than an exploration accepts."""

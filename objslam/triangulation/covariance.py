@@ -179,8 +179,8 @@ def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
 
     miss: (R,) normalised residuals. Their mean is used, because it is more robust than their mean square. taken: the number
     of degrees of freedom that the fit uses up, of 2 n for n rays. The excess over 1 is multiplied by 1 + 3.2 / (rest - 2),
-    because few remaining degrees of freedom (`rest`) give an uncertain estimate. This is the 95 % quantile of F(3, rest),
-    divided by its limit for a large rest. It is exact to 3 % from 4 rays on.
+    because few remaining degrees of freedom (`rest`) give an uncertain estimate. This multiplier is the 95 % quantile of
+    F(3, rest), divided by its limit for a large rest, exact to 3 % from 4 rays on.
     """
     number = as_type(rays.number, miss)
     mean = group_sum(miss, rays.index, len(number)) / number.clip(min=1) / RAYLEIGH_MEAN
