@@ -1,7 +1,7 @@
-"""Functions that work on numpy arrays and on torch tensors alike, and the choice between the two libraries.
+"""Functions that work on numpy arrays and on torch tensors, and the choice between the two libraries.
 
-Such code takes the library of an array from `module_of`, and calls its functions with `axis=` and positional arguments,
-which both libraries accept. torch is imported only if it may be used.
+Code for both libraries gets the library of an array from `module_of`. It calls functions of the library with `axis=` and
+positional arguments, which both libraries accept. torch is imported only if it may be used.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ Backend = Literal["numpy", "cpu", "cuda"]
 def chosen_backend(device: str, large: bool) -> Backend:
     """Choose numpy or torch on CUDA for a batch. device: the setting `triangulation.device`.
 
-    With "auto", a `large` batch runs on CUDA if torch sees a CUDA device. Any other batch, and every one with "cpu", runs in
-    numpy. torch on a CPU is never chosen. For 50,000 to 1,000,000 rays, it took 1.2 to 2.6 times the CPU time of numpy. Only
-    tests use it, to run the code for CUDA.
+    With "auto", a `large` batch runs on CUDA if torch sees a CUDA device. All other batches, and all batches with "cpu", run
+    in numpy. torch on a CPU is never chosen. For 50,000 to 1,000,000 rays, it took 1.2 to 2.6 times the CPU time of numpy.
+    Only tests use it, to run the code for CUDA.
 
     Raises:
         ConfigError: the setting is "cuda", and torch is not installed or sees no CUDA device.
     """
     if device == "cpu" or (device == "auto" and not large):
-        return "numpy"  # Most batches. Some take no longer than the search for torch.
+        return "numpy"  # This is for most batches. Some batches take no longer than the search for torch.
     installed = find_spec("torch") is not None
     if device == "cuda" and not installed:
         raise ConfigError("triangulation.device=cuda needs torch", hint='pip install "objslam[torch]"')
@@ -65,7 +65,7 @@ def _has_driver() -> bool:
 def array_backend(device: str, large: bool) -> Iterator[Backend]:
     """Prepare the library that `chosen_backend` chooses for a batch.
 
-    The warnings of numpy about divisions by zero, overflows and invalid values are switched off, because torch has none.
+    The warnings of numpy about divisions by zero, overflows and invalid values are off, because torch has no such warnings.
     torch gets one thread, because the threads of a pool use their cores even while they wait. With one of two cores busy, a
     run took 4 s with one thread and up to 18 s with two.
     """

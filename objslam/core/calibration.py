@@ -13,10 +13,10 @@ from objslam.core.types import Keyframes, Rays
 
 OBSERVABLE = 0.8
 """The largest standard deviation of an observable parameter, as a share of the standard deviation of its prior. At 0.8, the
-log gives about half as much information as the prior. A larger share calls more parameters observable."""
+log gives about half as much information as the prior. With a larger share, more parameters count as observable."""
 TRADED_OFF = 0.9
-"""The absolute correlation above which two parameters trade off. The log hardly tells such parameters apart. With a larger
-value, fewer pairs trade off."""
+"""The absolute correlation above which two parameters trade off. The log can hardly separate the effects of such parameters.
+With a larger value, fewer pairs trade off."""
 
 SCALES = ("scale", "lateral_scale", "turn_scale", "range_scale", "tag_scale", "focal")
 """The kinds of parameters that are shares. The correction multiplies a measurement by 1 + the share."""
@@ -29,7 +29,7 @@ OF_PLACES = ("tag_scale", "surface")
 """The kinds of parameters that belong to a place, not to a robot. The calibration of a robot has none of them."""
 MOST_SCALE = 0.5
 """The largest absolute value of a share. A larger bound lets a solve shrink lengths towards zero. An error of more than half
-means a wrong unit, and a calibration should not hide that."""
+means a wrong unit, and a calibration should not hide a wrong unit."""
 
 UNITS = {
     "clock": "s",
@@ -93,13 +93,13 @@ class Calibration:
         return np.diag(self.prior**2) if self.prior_covariance is None else self.prior_covariance
 
     def traded_off(self) -> list[tuple[str, str]]:
-        """Return the pairs of parameters that the log cannot tell apart: their errors are highly correlated."""
+        """Return the pairs of parameters whose errors are so highly correlated that the log cannot separate the two."""
         correlation = self.covariance / np.outer(self.sigma, self.sigma)
         first, second = np.nonzero(np.triu(np.abs(correlation) > TRADED_OFF, 1))
         return [(self.names[i], self.names[j]) for i, j in zip(first, second, strict=True)]
 
     def of_robot(self) -> Self:
-        """Return the calibration without the parameters of the place (`OF_PLACES`): the marginal of the others."""
+        """Return the marginal of the parameters of the robot, which is without the parameters of the place (`OF_PLACES`)."""
         own = np.flatnonzero([name not in OF_PLACES for name in self.names])
         square = np.ix_(own, own)
         return replace(
@@ -144,7 +144,7 @@ class Calibration:
 def combine(calibrations: Sequence[Calibration]) -> Calibration:
     """Combine calibrations of one robot from several logs. Their information adds up, and the prior counts once.
 
-    A parameter that only some logs have is estimated from these logs. Its prior is from the first log that has it,
+    A parameter that only some logs have is estimated from these logs. Its prior is from the first log with the parameter,
     conditional on the parameters that this log shares with earlier logs.
     """
     names = tuple(dict.fromkeys(name for one in calibrations for name in one.names))
@@ -155,7 +155,7 @@ def combine(calibrations: Sequence[Calibration]) -> Calibration:
         before = np.linalg.inv(one.before)
         own = np.linalg.inv(one.covariance) - before
         size, axes = np.linalg.eigh((own + own.T) / 2)
-        own = (axes * np.maximum(size, 0.0)) @ axes.T  # Rounding may make information negative.
+        own = (axes * np.maximum(size, 0.0)) @ axes.T  # Rounding errors may make information negative.
         told[np.ix_(at, at)] += own
         told_vector[at] += (own + before) @ one.values - before @ one.expected
         # Earlier logs gave the prior of the known parameters. This log adds p(new | known) = p(new, known) / p(known).
@@ -220,13 +220,12 @@ class CalibratedMeasurements(Protocol):
 
     @property
     def unknown_noise(self) -> frozenset[str]:
-        """The kinds of noise that are estimated: any of `rays`, `ranges`, `odometry` and
-        `localization`."""
+        """The kinds of noise that are estimated: any of `rays`, `ranges`, `odometry` and `localization`."""
 
     @property
     def unknown_scales(self) -> frozenset[str]:
-        """The scale parameters, if the log leaves the scale of its map open, else an empty set. The scale is open if each
-        kind of measured length has a scale parameter, and no absolute pose is measured."""
+        """The scale parameters, if the log does not determine the scale of its map, else an empty set. The scale is
+        undetermined if each kind of measured length has a scale parameter, and no absolute pose is measured."""
 
     def take(self, keyframes: Keyframes, rays: Rays) -> Self:
         """Return the same errors for other keyframes and rays of the log."""

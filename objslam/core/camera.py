@@ -22,7 +22,7 @@ COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {
 """The numbers of distortion coefficients that each model accepts."""
 
 _STEPS, _FINER = 2000, 4  # Angles of a grid and number of grids in the search for a lens's fold. More are more exact.
-_ALONG = 200  # The number of pieces of an image side in the sum for the solid angle. More are slower and more exact.
+_ALONG = 200  # The number of pieces of an image side in the sum for the solid angle. More pieces are slower and more exact.
 _LEAST = 1e-9  # The least solid angle of a camera, sr. It keeps a division by the solid angle finite.
 _TURNS, _EXACT, _FLAT = 60, 1e-14, 1e-12  # The most Newton iterations, the step to stop at (rad) and the least divisor.
 
@@ -46,8 +46,8 @@ class Camera:
 
     matrix: (3, 3) px. distortion: (D,) coefficients. base_T_camera: (4, 4) the pose of the optical frame in base.
     depth_scale: the units of a depth image per metre. sees_size: whether the boxes show how large the objects are. A box
-    that only marks a bearing does not. depth_noise: the noise of the camera's depths, None for the noise in the settings
-    `depth`.
+    that only marks a bearing shows no size. depth_noise: the noise of the camera's depths, None for the noise in the
+    settings `depth`.
     """
 
     name: str
@@ -78,7 +78,8 @@ class Camera:
 
     @cached_property
     def fisheye(self) -> bool:
-        """Whether the image radius of a point grows with its angle to the optical axis, not with the angle's tangent."""
+        """Whether the image radius of a point grows with the angle of the point to the optical axis, not with its
+        tangent."""
         return self.distortion_model == "equidistant"
 
     @cached_property
@@ -186,7 +187,7 @@ def _undistort_newton(camera: Camera, pixels: Floats) -> Floats:
     for _ in range(_TURNS):
         homogeneous = np.column_stack([flat, np.ones(len(flat))])
         again, by = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
-        slope = by[:, 3:5].reshape(-1, 2, 2)  # The derivatives by the translation are those by the point.
+        slope = by[:, 3:5].reshape(-1, 2, 2)  # The derivatives by the translation equal those by the point.
         step = (np.linalg.pinv(slope) @ (pixels - again[:, 0])[..., None])[..., 0]
         trial = flat + factor[:, None] * step
         closer = _misses(camera, trial, pixels)
@@ -286,7 +287,8 @@ def _fisheye_radius(camera: Camera) -> Floats:
 def _growth(camera: Camera, angle: Floats) -> Floats:
     """Return how fast (A,) the image radius grows at angles (A,), rad. Beyond the fold this is <= 0.
 
-    For a fisheye it is the derivative by the angle, else the least derivative by tan(angle) over all image directions.
+    For a fisheye lens, the growth is the derivative by the angle. For other lenses, it is the least derivative by tan(angle)
+    over all image directions.
     """
     with np.errstate(all="ignore"):  # A wrong calibration may overflow.
         if camera.fisheye:
@@ -298,7 +300,7 @@ def _growth(camera: Camera, angle: Floats) -> Floats:
         divisor[::2] = 1.0, *k[5:8]
         below = polyval(t, divisor)
         radial = (polyval(t, polyder(radius)) * below - polyval(t, radius) * polyval(t, polyder(divisor))) / below**2
-        # Decentering and thin prisms reduce the radial growth by at most this much in any direction.
+        # Decentering and thin prisms reduce the radial growth by at most this amount in any direction.
         across = (6 * np.hypot(k[2], k[3]) + 2 * np.hypot(k[8], k[10])) * t + 4 * np.hypot(k[9], k[11]) * t**3
         return np.asarray(np.where(below > 0, radial - across, 0.0))
 
@@ -312,7 +314,7 @@ def box_sizes(box: Floats, direction: Floats, cameras: Sequence[Camera], camera:
     focal = np.array([[c.matrix[0, 0], c.matrix[1, 1]] for c in cameras])[camera]
     pinhole = np.array([not c.fisheye for c in cameras])[camera]
     depth = np.where(pinhole, direction[:, 2], 1.0)  # The size in a pinhole image falls with z, not with distance.
-    # If a box is read in another order than it was written, a side may be negative.
+    # If the corners of a box are read in another order than they were written, a side may be negative.
     return np.asarray(np.maximum(box[:, 2:] - box[:, :2], 0.0) / focal * depth[:, None])
 
 

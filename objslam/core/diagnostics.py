@@ -18,8 +18,8 @@ def is_drop(line: str) -> bool:
 
 @dataclass
 class Ledger:
-    """The dropped data by reason, and warnings of one line each. For each reason: the count, the first places, and the
-    number of data that were checked, if known. unused: the paths of the robot in the log that a run does without."""
+    """The dropped data by reason, and warnings of one line each. A reason has the count, the first places, and the number of
+    data that were checked, if known. unused: the paths of the robot in the log that a run does not use."""
 
     dropped: dict[str, int] = field(default_factory=dict)
     totals: dict[str, int] = field(default_factory=dict)

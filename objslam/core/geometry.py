@@ -27,8 +27,8 @@ _ON_A_LINE = 1e-9
 """The largest second singular value of the cross-covariance of points on a line, as a share of the first one. A larger share
 treats more point sets as lines. Rounding leaves about 1e-15."""
 _FEW_POINTS = 100
-"""The most points between which all distances are computed. For more points, a search tree takes less time. Few points need
-no tree, and so no import of scipy.spatial, which takes 0.07 s."""
+"""The most points between which all distances are computed. For more points, a search tree takes less time. Few points do
+not need a tree, whose import from scipy.spatial takes 0.07 s."""
 
 
 def make_pose(rotation: Floats, translation: Floats) -> Floats:
@@ -96,7 +96,7 @@ def is_planar(poses: Floats) -> bool:
 
 
 def log_se3(pose: Floats) -> Floats:
-    """Return the logarithms (N, 6) of poses (N, 4, 4). The exponential of such a twist is the pose."""
+    """Return the logarithms (N, 6) of poses (N, 4, 4). The exponential of the result is the pose."""
     omega = rotation_vector(pose[..., :3, :3])
     squared, small, divisor = _squares(omega)
     half = np.sqrt(divisor) / 2
@@ -137,7 +137,7 @@ def motion_between(before: Floats, after: Floats) -> Motion:
     (a0, a1, a2, ax), (b0, b1, b2, by), (c0, c1, c2, cz) = before[:3].tolist()
     (d0, d1, d2, dx), (e0, e1, e2, ey), (f0, f1, f2, fz) = after[:3].tolist()
     trace = a0 * d0 + b0 * e0 + c0 * f0 + a1 * d1 + b1 * e1 + c1 * f1 + a2 * d2 + b2 * e2 + c2 * f2
-    # Half the sum of the cross products of the axes before and after is the rotation axis times the sine of the angle.
+    # The rotation axis times the sine of the angle is half the sum of the cross products of the axes before and after.
     u = (b0 * f0 - c0 * e0 + b1 * f1 - c1 * e1 + b2 * f2 - c2 * e2) / 2
     v = (c0 * d0 - a0 * f0 + c1 * d1 - a1 * f1 + c2 * d2 - a2 * f2) / 2
     w = (a0 * e0 - b0 * d0 + a1 * e1 - b1 * d1 + a2 * e2 - b2 * d2) / 2
@@ -269,8 +269,8 @@ def align(source: Floats, target: Floats, kind: Literal["none", "se2", "sim2", "
 
     Then scale * R @ source + t is nearest to target in least squares. The kind `none` gives the identity. `se2` estimates
     the yaw and the whole translation, and `se3` the full rotation. `sim2` and `sim3` add a scale. R is never a reflection.
-    With fewer than 2 points (3 for `se3` and `sim3`), only the translation is estimated. Points on a line leave the rotation
-    about the line open. Then R is the smallest of the best rotations.
+    With fewer than 2 points (3 for `se3` and `sim3`), only the translation is estimated. Points on a line do not determine
+    the rotation about the line. For such points, R is the smallest of the best rotations.
     """
     if kind == "none" or len(source) == 0:
         return np.eye(4), 1.0

@@ -30,8 +30,8 @@ class NoiseFactors:
     across: `odometry.y_per_m` and `odometry.floor_xy`. turning: the odometry's noise of the heading. heading:
     `localization.yaw`. place: `localization.xy`. shrinkage: the share by which a joint solve makes all lengths too short.
     Four fields describe lasting errors (`Lasting`) of localised headings and places. heading_share, place_share: the share
-    of the variance that lasts. heading_seconds, place_seconds: how long this part lasts, s. by_label: the noise of the
-    ranges of some labels. It replaces `ranges` and `range_bias` for these labels.
+    of the variance that lasts. heading_seconds, place_seconds: how long the lasting part lasts, s. by_label: the noise of
+    the ranges of some labels. It replaces `ranges` and `range_bias` for these labels.
     """
 
     rays: float = 1.0
@@ -125,12 +125,12 @@ FACTORS = ("rays", "ranges", "range_bias", "along", "across", "turning", "headin
 
 MOST_NOISE = 20.0
 """The largest estimated factor on a noise. With a larger factor, wrong units or axes of measurements are taken for noise.
-Real robots have up to 6.3, for odometry that is only the commanded speed."""
+Real robots have factors up to 6.3. The largest factor is of odometry that is only the commanded speed."""
 
 MOST_POSE_NOISE = 300.0
 """The largest estimated factor on `localization.xy` and `localization.yaw`. With the default settings, it allows errors of 6
-m, as of a GPS between houses, and any error of the heading. With a larger factor, wrong units of a path are taken for
-noise."""
+m, such as those of a GPS between houses, and any error of the heading. With a larger factor, wrong units of a path are taken
+for noise."""
 
 NOMINAL = NoiseFactors()
 """The noise in the settings, unchanged."""
@@ -147,6 +147,6 @@ def range_noise(
     of = settings.depth
     told = [(of.sigma, of.sigma_per_m, of.bias) if c.depth_noise is None else astuple(c.depth_noise) for c in cameras]
     sigma, per_m, bias = np.array(told, dtype=np.float64).reshape(-1, 3)[camera].T
-    # How far the centre is behind the surface differs between logs, and between the things of a log.
+    # The distance of the centre behind the surface differs between logs, and between the things of a log.
     share = np.hypot(of.centre_sigma, settings.calibration.surface)
     return sigma + per_m * ranges, np.hypot(bias, share * half * ranges)

@@ -21,7 +21,7 @@ from objslam.core.statistics import SAME_POINT
 Status = Literal["ok", "unresolved"]
 Fate = Literal["confirmed", "moved", "gone", "new", "unconfirmed"]
 FATES: tuple[Fate, ...] = ("confirmed", "moved", "gone", "new", "unconfirmed")
-"""What can become of an object over several sessions. Outputs show these words in this order. A comparison of two maps uses
+"""The possible fates of an object over several sessions. Outputs show the words in this order. A comparison of two maps uses
 the same words."""
 
 _FLOOR = 1e-6  # The least standard deviation (m) between two positions. It keeps singular covariances invertible.
@@ -61,13 +61,13 @@ class SeenFrom:
 class Life:
     """The history of one object over several sessions.
 
-    state: `unconfirmed` if one session found it, and no other session had its place in view. `new` if one session found it,
-    and an earlier session would have found it there, or does not say what it had in view. `confirmed` if a later session
-    found it again, `moved` if a later session found it at another position, `gone` if later sessions show that it has left.
-    probability: the probability that the object is still at its position. sessions_expected, sessions_seen: in how many
-    sessions it was in view, and in how many it was found. looks, detections: in how many camera frames of all sessions it
-    was in view, and in how many it was detected. updated: the time of the last session, s. moved_from: (3,) m, where it was
-    before it moved, None if it did not move.
+    state: `unconfirmed` if one session found the object, and no other session had its place in view. `new` if one session
+    found it, and an earlier session should have found it there, or has no record of its view. `confirmed` if a later session
+    found it again. `moved` if a later session found it at another position. `gone` if later sessions show that it has left.
+    probability: the probability that the object is still at its position. sessions_expected, sessions_seen: the number of
+    sessions with the object in view, and of sessions that found it. looks, detections: the number of camera frames of all
+    sessions with the object in view, and of frames with a detection of it. updated: the time of the last session, s.
+    moved_from: (3,) m, the position before it moved, None if it did not move.
     """
 
     state: Fate
@@ -88,7 +88,7 @@ class MapObject:
     the object. parallax_deg: the widest angle between two such rays. rms_deg: the root mean square of the angles between
     these rays and the object. first_seen, last_seen: stamps, s. extent: width and height, m, None if unknown. ray: the
     origin (3,), m, and the direction (3,) of one ray of an unresolved object. labels: the share of each label among the
-    boxes. existence: the probability that the object exists. labels and existence are None if the run took all boxes of a
+    boxes. existence: the probability that the object exists. labels and existence are None if the run treated all boxes of a
     label as one object. seen_from: from where it was detected, None if unknown. life: its history over several sessions,
     None in the map of a single run. tag: the rotation and size of a fiducial, None for an object that is no fiducial. body:
     its size and heading around the position, None for a point. ray_point: (3,) m, where the rays through the centres of its
@@ -119,8 +119,8 @@ class MapObject:
     features: Floats32 | None = None
 
     def at(self, position: Floats) -> Self:
-        """Return the object at another position (3,), m. It is `dataclasses.replace` in a tenth of the time, because a
-        snapshot moves all objects."""
+        """Return the object at another position (3,), m. This takes a tenth of the time of `dataclasses.replace`. The time
+        matters, because a snapshot moves all objects."""
         moved = object.__new__(type(self))
         vars(moved).update(vars(self), position=position)
         return moved
@@ -259,10 +259,10 @@ class ObjectMap:
         """Merge another map into this one, and fuse the objects that both maps have.
 
         Two resolved objects of one label may be the same if the Mahalanobis distance of their positions is below the 99 %
-        quantile. The Hungarian method makes as many one-to-one pairs as it can, with the least sum of squared distances. The
-        two positions of a pair are fused like two independent measurements, weighted by their information. Objects of this
-        map keep their ids, and its `gone` stays as it is. Objects that only the other map has get new ids. ValueError if the
-        two coordinate frames have different names.
+        quantile. The Hungarian method makes the most one-to-one pairs, with the least sum of squared distances. The two
+        positions of a pair are fused like two independent measurements, weighted by their information. Objects of this map
+        keep their ids, and its `gone` stays as it is. Objects that only the other map has get new ids. ValueError if the two
+        coordinate frames have different names.
         """
         if self.frame != other.frame:
             raise ValueError(f"the maps are in two frames, {self.frame!r} and {other.frame!r}: transform one map first")
@@ -299,7 +299,7 @@ def _same_objects(ours: tuple[MapObject, ...], theirs: tuple[MapObject, ...]) ->
         columns = [column for column, k in enumerate(its) if theirs[k].label == label]
         squared[np.ix_(rows, columns)] = _mahalanobis([ours[mine[r]] for r in rows], [theirs[its[c]] for c in columns])
     allowed: Bools = squared <= SAME_POINT
-    # A pair that is not allowed costs more than all allowed pairs together, so it displaces none of them.
+    # A pair that is not allowed costs more than all allowed pairs together, so it replaces no allowed pair.
     cost = np.where(allowed, squared, SAME_POINT * (min(squared.shape) + 1))
     pairs = np.column_stack(linear_sum_assignment(cost)).tolist() if allowed.any() else []
     return [(mine[row], its[column]) for row, column in pairs if allowed[row, column]]
@@ -318,7 +318,7 @@ def _fuse(a: MapObject, b: MapObject) -> MapObject:
     """Fuse two measurements of one object. The result has the id and the label of the first."""
     assert a.covariance is not None
     assert b.covariance is not None
-    # A Kalman gain gives the same as a sum of information matrices, and also works with a singular covariance.
+    # A Kalman gain gives the same result as a sum of information matrices, and also works with a singular covariance.
     gain = a.covariance @ np.linalg.inv(a.covariance + b.covariance + _FLOOR**2 * np.eye(3))
     covariance = (np.eye(3) - gain) @ a.covariance
     share = a.rays / max(a.rays + b.rays, 1)

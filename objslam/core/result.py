@@ -19,8 +19,8 @@ from objslam.core.types import Association, Images, Keyframes, Rays
 
 DoubtKind = Literal["pair", "split", "moved", "unresolved", "unsure", "boxes", "label"]
 DOUBT_KINDS: tuple[DoubtKind, ...] = ("pair", "split", "moved", "unresolved", "unsure", "boxes", "label")
-"""The kinds of doubts: two objects that may be one, an object that may be two, an object that was there for a part of the
-drive, an object without a position, an object with a wide sigma, boxes that became no object, and a label without an
+"""The kinds of doubts: two objects that may be one, an object that may be two, an object that was present for a part of the
+drive, an object without a position, an object with a large sigma, boxes that belong to no object, and a label without an
 object."""
 
 

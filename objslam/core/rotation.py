@@ -8,8 +8,8 @@ import numpy as np
 from objslam.core.arrays import Floats
 
 _SMALL = 1e-4
-"""The sine of a rotation angle, or of half of the angle, below which a series replaces angle / sine. That ratio tends to 0 /
-0. A larger value makes the series less exact. At this value, its relative error is below 1e-17."""
+"""The sine of a rotation angle, or of half of the angle, below which a series replaces angle / sine. Near 0, the ratio would
+be 0 / 0. A larger value makes the series less exact. At this value, its relative error is below 1e-17."""
 
 
 def _cross_product_map() -> Floats:
@@ -106,7 +106,7 @@ def quaternion_from_rotation(rotation: Floats) -> Floats:
 
     If w = 0, both q and -q have w >= 0. Then the first number of the result that is not 0 is positive.
     """
-    # Row i is 4 q[i] q, where q is the quaternion. The row with the largest diagonal entry is the most exact one.
+    # Row i is 4 q[i] q, where q is the quaternion. The row with the largest diagonal entry is the most exact row.
     outer = np.empty((*rotation.shape[:-2], 4, 4))
     diagonal = np.diagonal(rotation, axis1=-2, axis2=-1)
     trace = diagonal.sum(axis=-1)

@@ -39,8 +39,8 @@ class CameraFrame:
 class InPriorMap:
     """The place of a session in a prior map.
 
-    objects: how many objects of the prior map the session found again, 0 while the place is unknown. line: a sentence for
-    the user, with this number and the evidence, or with the reason why the place is unknown.
+    objects: the number of objects of the prior map that the session found again, 0 while the place is unknown. line: a
+    sentence for the user, with this number and the evidence, or with the reason why the place is unknown.
     """
 
     objects: int
@@ -53,12 +53,12 @@ class Snapshot:
 
     stamp: the time of the newest keyframe, s, NaN before the first keyframe. map: the objects, as an offline run returns
     them. path: map_T_base of all keyframes. keyframes, rebuilds: the number of keyframes, and how often the graph was
-    rebuilt. lag: the time, s, that the newest frame in the map took from its arrival until the map contained it. update: the
-    median and the 99th percentile of the lag of recent frames, s. counters: how many messages of each kind were accepted.
-    dropped: how many data were dropped, by reason. frames: the newest keyframe of each camera, without its image.
-    calibration: the shared errors that the session corrects in its measurements, None if it corrects none. map_T_odom:
-    (4, 4) the pose of the odometry's frame in the map at the newest keyframe (REP 105). It holds for odometry as the robot
-    sends it, without corrections. None if the odometry does not cover this keyframe. in_map: the place in a prior map, None
+    rebuilt. lag: the time, s, from the arrival of the newest frame in the map until the map contained this frame. update:
+    the median and the 99th percentile of the lag of recent frames, s. counters: how many messages of each kind were
+    accepted. dropped: how many data were dropped, by reason. frames: the newest keyframe of each camera, without its image.
+    calibration: the shared errors that the session corrects in its measurements, None if it corrects none. map_T_odom: (4,
+    4) the pose of the odometry's frame in the map at the newest keyframe (REP 105). It holds for odometry as the robot sends
+    it, without corrections. None if the odometry does not cover this keyframe. in_map: the place in a prior map, None
     without such a map or before the first search for it. Once the place is known, everything is in the frame of the prior
     map.
     """

@@ -24,11 +24,11 @@ STRAY_RAY = 13.816
 """The 99.9 % quantile of the squared deviation of an object's own rays (chi-squared, 2 degrees of freedom). It is also the
 cost of a ray that fits no object. A larger deviation gives rays of other things more influence on the solution."""
 OUTLIER_RAY = 4.0
-"""The deviation above which a ray is rejected. A share of 3e-4 of an object's own rays exceeds it (Rayleigh, exp(-4^2 / 2)).
-A larger deviation keeps more false boxes."""
+"""The deviation above which a ray is rejected. A share of 3e-4 of an object's own rays has a larger deviation (Rayleigh,
+exp(-4^2 / 2)). A larger deviation keeps more false boxes."""
 CLIPPED_RAY = 6.0
-"""The largest deviation with which a ray counts in the measured noise of an object. A ray with a larger one counts as if it
-had this deviation. A larger value lets a false box raise this noise more."""
+"""The largest deviation with which a ray counts in the measured noise of an object. A ray with a larger deviation counts
+with this deviation. With a larger value, a false box increases the measured noise more."""
 HALF_RAY = 6.0
 """The squared deviation at which a ray has half of its full weight in a fit of points (Cauchy's weight, about `CAUCHY_K`
 squared). A larger deviation gives rays of other things more influence."""
@@ -63,7 +63,7 @@ POOLED_WITH_PROMISE = 20.0
 keeps objects near the nominal noise for longer."""
 BETWEEN_VISITS = 5.0
 """The shortest time (s) between two visits to a thing. In a longer time, a moving thing gets farther. With a longer time,
-things have fewer visits, so more of them are dropped as things that move."""
+things have fewer visits, so more things are dropped as moving things."""
 _LARGE_GROUPS = 100
 """The mean number of values in a group above which a partition of each group is faster than a sort of all values. For
 200,000 values in 200 groups, the partition took 2.8 ms and the sort 7.4 ms. A larger number sorts more often."""
@@ -75,15 +75,15 @@ _FEW_GROUPS = 1 << 16
 class Lasting:
     """The part of an error that a first-order Gauss-Markov process describes. The rest of the error is white.
 
-    share: the share of this part in the variance, 0 for an error that is new in each pose, 1 for an error without a white
-    part. seconds: the time (s) after which the correlation of the lasting part is 1/e.
+    share: the share of the lasting part in the variance, 0 for an error that is independent in each pose, 1 for an error
+    without a white part. seconds: the time (s) after which the correlation of the lasting part is 1/e.
     """
 
     share: float = 0.0
     seconds: float = 0.0
 
     def like(self, other: "Lasting", tolerance: float) -> bool:
-        """Return whether the shares differ by less than a tolerance, and the logarithms of the times also do."""
+        """Return whether the shares, and the logarithms of the times, each differ by less than a tolerance."""
         if not self.share or not other.share:
             return self.share == other.share
         times = abs(math.log(max(self.seconds, 1e-9) / max(other.seconds, 1e-9)))
@@ -91,7 +91,7 @@ class Lasting:
 
 
 WHITE = Lasting()
-"""An error that is new in each pose."""
+"""An error that is independent in each pose."""
 
 
 def noise_factors(deviations: Floats, index: Ints, count: int, fewest: int = 1) -> Floats:
@@ -203,7 +203,7 @@ _FEW = 20_000
 the association of a small log. The computation without it takes 0.02 s for this many numbers."""
 _DEVIATIONS = 9.0
 """The number of standard deviations above the mean up to which a Poisson tail is summed. For small means, the square of this
-number is added to the limit. What lies beyond is below 1e-16 of the tail. A larger number makes the sum longer."""
+number is added to the limit. The rest is below 1e-16 of the tail. A larger number makes the sum longer."""
 
 
 def logistic(odds: Floats) -> Floats:
@@ -224,7 +224,7 @@ def poisson_tail(least: Ints, mean: Floats) -> Floats:
     beyond = np.maximum(mean - count, 0.0) + _DEVIATIONS * np.sqrt(np.maximum(mean, count)) + _DEVIATIONS**2
     terms = math.ceil(float(beyond.max(initial=0.0)))
     if terms * len(count) <= _FEW:
-        # Logarithms, because a large mean has a first term of 0 and ratios that overflow.
+        # Logarithms are used, because for a large mean the first term would be 0, and ratios would overflow.
         with np.errstate(divide="ignore", under="ignore"):
             logs = np.empty((len(count), max(terms, 1)))
             logs[:, 0] = count * np.log(mean) - mean - _log_gamma(count + 1)
@@ -247,7 +247,7 @@ def binomial_tail(least: Ints, number: Ints, share: float) -> Floats:
     least, number = (np.asarray(of).astype(np.int64) for of in np.broadcast_arrays(least, number))
     most = int(number.max(initial=0)) + 1
     if most * number.size <= _FEW:
-        factorials = np.append(0.0, np.cumsum(np.log(np.arange(1.0, most))))  # Their logarithms.
+        factorials = np.append(0.0, np.cumsum(np.log(np.arange(1.0, most))))  # The logarithms of the factorials.
         count = np.arange(most)
         left = number[..., None] - count
         logs = factorials[np.maximum(number, 0)][..., None] - factorials - factorials[np.maximum(left, 0)]

@@ -66,7 +66,7 @@ class Trace:
     """A collector of the rounds of an estimation.
 
     base_T_camera: (K, 4, 4) the camera on the robot at each keyframe. count: the number of objects, which are the first
-    positions of an iteration. Later positions, such as the corners of fiducials, are left out. None keeps all positions.
+    positions of an iteration. Later positions, such as corners of fiducials, are left out. If None, all positions are kept.
     """
 
     base_T_camera: Floats
@@ -96,6 +96,6 @@ class Trace:
         self._iterations = list(attempt._iterations)
 
     def end_round(self, why: Why, association: Association, estimate: Estimate) -> None:
-        """End a round. It gets all iterations since the end of the previous round."""
+        """End a round. The round gets all iterations since the end of the previous round."""
         iterations, self._iterations = tuple(self._iterations), []
         self.rounds.append(Round(why, association, iterations, estimate.map_T_base, estimate.positions, estimate.weight))

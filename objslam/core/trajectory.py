@@ -53,7 +53,8 @@ def rates(path: Trajectory, stamps: Floats) -> tuple[Floats, Floats]:
 def usual_seconds(seconds: Floats) -> Floats:
     """Return the times (N, ...), s, of the steps of a path, none of them shorter than the median.
 
-    Poses that are stamped when they arrive come in groups if they had to wait. Steps inside a group seem to take no time.
+    If poses are stamped at their arrival, poses that had to wait arrive in a group. Steps inside a group seem to take no
+    time.
     """
     return np.maximum(seconds, np.median(seconds))
 

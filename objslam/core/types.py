@@ -30,16 +30,17 @@ _BOX_COLUMNS = ("frame", "label", "scores", "depths", "track_ids")  # The fields
 
 @dataclass(frozen=True)
 class Detections:
-    """All boxes of one camera. A frame is one image. Frames without a box are kept: they show what the camera did not see.
+    """All boxes of one camera. A frame is one image. Frames without a box are kept, because they show what the camera did
+    not see.
 
     frame_stamps: (F,) s, strictly increasing. frame: (M,) index into frame_stamps, non-decreasing. boxes: (M, 4) x1, y1, x2,
     y2 in px of the raw (distorted) image. label: (M,) index into label_names. scores: (M,) in [0, 1]. depths: (M,) z along
     the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: whether the image's edge cuts off no box. This
-    is so for fiducials, because a detector must see all their corners. If so, the centres of boxes at the edge are also
+    is true for fiducials, because a detector must see all their corners. If true, the centres of boxes at the edge are also
     valid. corners: (M, 4, 2) px of the raw image, the corners of a square fiducial in its own order, NaN for another box.
     None if no box has corners. features: (M, D) unit appearance vectors, a row of NaN for a box without one. None if no box
     has one. second: (M,) index into label_names, the label of a box that was dropped because it lay on this box. It is -1
-    for a box on which no other box lay, and None if no box has such a label. ValueError if a shape, an index or the order is
+    for a box without such a label, and None if no box has such a label. ValueError if a shape, an index or the order is
     wrong.
     """
 
@@ -170,8 +171,8 @@ class Keyframes:
     4) from the localisation, or from the odometry if there is no localisation. localized_every: how many keyframes there are
     for each measured absolute pose, on average and at least 1. 0 if map_T_base is odometry. localized_at: (K,) s, the stamp
     of the measurement of the localisation that gave the pose, NaN if the odometry continued the localisation. None if each
-    pose was measured by itself. carried: (K, 2) rad^2 and m^2, what the odometry from this measurement to the keyframe adds
-    to the variance of heading and place, None if it adds nothing. overlap: the share of the keyframes of one moment that can
+    pose was measured by itself. carried: (K, 2) rad^2 and m^2, the variance that the odometry from this measurement to the
+    keyframe adds to heading and place, None if it adds nothing. overlap: the share of the keyframes of one moment that can
     show the same thing: 1 for one camera, a quarter for four that look to four sides. pose_noise: the factors on
     `localization.yaw` and `localization.xy` that the log shows, 1 if they are not estimated. lasting: the parts of the
     errors of headings and of places that last, in joint mode. odom_T_base: (K, 4, 4) in the frame of the first odometry
@@ -180,7 +181,7 @@ class Keyframes:
     one stretch. It is -1 without odometry, where odom_T_base and drift have no meaning. step: (K,) the place of each
     keyframe among the steps of the odometry. wander: (K, 6) the variance of that step. Both are from `OdometryBridge.at`,
     and None if the odometry is exact between its poses. given_stamps: (K,) s, the stamps of the frames in the log or from
-    the robot, None if they are `stamps`. driven: (K,) m, the `way` before any correction, None if nothing was corrected.
+    the robot, None if they are `stamps`. driven: (K,) m, the `way` before any correction, None if there was no correction.
     """
 
     stamps: Floats

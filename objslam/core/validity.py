@@ -12,7 +12,7 @@ MAX_POSITION = 1e7
 origin of its UTM zone. At this bound, a float resolves 2 nm."""
 MAX_STAMP = 1e20
 """The bound of a stamp in a file, s. A larger bound accepts more wrong numbers. A stamp that is in ns by mistake is below
-the bound, so the checks of a run can name this mistake."""
+the bound, so that the checks of a run can name the mistake."""
 MAX_LIVE_STAMP = 1e11
 """The bound of a stamp of a running robot, s. A larger bound accepts more wrong numbers. At this bound, a float
 resolves 15 us."""
@@ -31,7 +31,7 @@ below it."""
 UNITS_OF_TIME = {1e3: "ms", 1e6: "us", 1e9: "ns"}
 """The name of each unit of time, by the number of units in a second."""
 _DATES = (1e8, 1e10)
-"""Stamps of dates between 1973 and 2286, s. A wider range leaves the unit of fewer stamps open."""
+"""The range of stamps, s, of dates between 1973 and 2286. With a wider range, the unit of fewer stamps is unknown."""
 _RIGID = 1e-3
 """The largest difference between R^T R and the identity in any entry. A larger value accepts worse rotations. Rotations that
 are printed with four decimals are below it."""
@@ -45,8 +45,8 @@ _ASYMMETRY = 1e-6
 """The largest difference between two mirrored entries of a covariance, as a share of the product of the two standard
 deviations. A larger share accepts numbers that were rounded to fewer digits."""
 _NOTHING = 1e-200
-"""The largest variance, in the square of any unit, that counts as 0. Products of smaller numbers have few digits left. A
-larger value leaves more correlations unchecked."""
+"""The largest variance, in the square of any unit, that counts as 0. Products of smaller numbers have few exact digits. With
+a larger value, more correlations are not checked."""
 _NEGATIVE = 1e-6
 """The tolerance of correlations. The least eigenvalue of a correlation matrix may be this far below 0, and a correlation may
 be this far beyond 1. A larger value accepts numbers that were rounded to fewer digits."""

@@ -25,7 +25,7 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
     The ledger counts the other boxes. A box is not usable if its score is too low, if its centre is outside the image, or if
     the lens model has no inverse at its centre. A box that the image's edge cuts off is not usable either, unless
     rays.border is negative or the detections are `whole`. In each frame, the `MAX_OF_LABEL` boxes of a label with the
-    highest scores are used. `Rays.cut` has the boxes that only the image's edge made unusable. The boxes of
+    highest scores are used. `Rays.cut` has the boxes that are unusable only because of the image's edge. The boxes of
     `parts_of_things` do not count.
     """
     label_names, _ = label_table([n for c in log.cameras if c.detections is not None for n in c.detections.label_names])
@@ -129,8 +129,8 @@ def _corner_rays(boxes: Detections, camera: Camera, settings: Settings, ledger: 
 def _features(boxes: Detections, before: list[Floats32 | None], camera: Camera, ledger: Ledger) -> Floats32 | None:
     """Return the appearance vectors (M, D) of boxes, None if the boxes have none that can be used.
 
-    Vectors of all cameras are compared, so they must have equal lengths. The first camera with vectors gives the length. The
-    ledger counts the vectors of another length.
+    Vectors of all cameras are compared, so their lengths must be equal. The first camera with vectors sets the length. The
+    ledger counts vectors of any other length.
     """
     if boxes.features is None:
         return None
@@ -169,10 +169,11 @@ def parts_of_things(
     ledger: Ledger,
     whole: bool,
 ) -> Bools:
-    """Return which boxes (M, 4) px of a camera show the thing of another box (`parts_of_boxes`). The ledger counts them.
+    """Return which boxes (M, 4) px of a camera show the thing of another box (`parts_of_boxes`). The ledger counts these
+    boxes.
 
-    Boxes with a low score are no reason to drop others. frame, label, scores: (M,) of each box. stamps: (M,) s, or one stamp
-    for all boxes. whole: as in `types.Detections`.
+    A box with a low score is no reason to drop another box. frame, label, scores: (M,) of each box. stamps: (M,) s, or one
+    stamp for all boxes. whole: as in `types.Detections`.
     """
     sure = np.flatnonzero(scores >= settings.rays.min_score)
     cut = np.zeros(len(sure), dtype=bool)
@@ -217,7 +218,7 @@ def _usable(
 
 
 def _wrong(boxes: Floats, scores: Floats, camera: Camera, settings: Settings) -> dict[str, Bools]:
-    """Return which boxes (M, 4) are unusable, by the reason, whether or not the image's edge cuts them off."""
+    """Return for each reason which boxes (M, 4) are unusable. A box that the image's edge cuts off is judged like others."""
     centre = (boxes[:, :2] + boxes[:, 2:]) / 2
     return {
         f"boxes below rays.min_score {settings.rays.min_score:g}": ~(scores >= settings.rays.min_score),
@@ -265,8 +266,8 @@ def _angle_sigma(camera: Camera, directions: Floats, boxes: Floats, settings: Se
 
 def _radians(camera: Camera, directions: Floats, pixels: Floats) -> Floats:
     """Convert distances (n,), px, in the image at unit directions (n, 3) to angles (n,), rad, between rays."""
-    # For each radian of ray angle, a pinhole image moves by f / cos(a)^2 along the radius and by f / cos(a) across it. Here
-    # a is the angle off the axis. The geometric mean gives one sigma for the ray. A fisheye image moves by f everywhere.
+    # If a ray turns by 1 rad, its pinhole image moves by f / cos(a)^2 along the radius and by f / cos(a) across it, where a
+    # is the angle off the axis. The geometric mean gives one sigma for the ray. A fisheye image moves by f everywhere.
     if camera.fisheye:
         return pixels / camera.focal
     return pixels / camera.focal * directions[:, 2] ** 1.5

@@ -21,13 +21,13 @@ _CENTRE_SHARE = 0.5
 _MIN_VALID_SHARE = 0.1
 """The least share of valid pixels for a depth to be read. A larger share leaves more boxes without a depth."""
 _LEAST_SHOWN = 0.1
-"""The least share of the valid pixels that show the thing, if the others show what is behind it. A larger share takes thin
-things, such as a tripod, for the wall behind them. With a smaller share, a few nearer pixels that only hide a strip of the
-thing are taken for the thing."""
+"""The least share of the valid pixels that must show the thing, if the other pixels show the background. With a larger
+share, thin things, such as a tripod, get the depth of the wall behind them. With a smaller share, a box gets the depth of a
+thing that hides only a strip of its own thing."""
 _APART = 4.0
-"""The least distance between the depths of two different surfaces, in standard deviations of the nearer depths. The halves
-of one Gaussian are 2.3 apart, and the halves of a plane that recedes are 2.7 apart. With a larger number, fewer backgrounds
-are found."""
+"""The least distance between the depths of two different surfaces, in standard deviations of the nearer depths. The two
+halves of one Gaussian are 2.3 apart, and the two halves of a sloping plane are 2.7 apart. With a larger number, fewer
+backgrounds are found."""
 MAX_IMAGE_LAG = 0.02
 """The longest time (s) between the stamps of the colour image and the depth image of one frame. Some cameras give the two
 images different stamps. A longer time pairs images of different moments."""
@@ -75,8 +75,8 @@ def box_depth(image: NDArray[Any], box: Floats, focal: float) -> float:
 def _of_thing(depths: Floats, size: float) -> Floats:
     """Return the depths, among depths (n,), that belong to the nearest surface.
 
-    A thing may be as deep as it is wide or high. What is farther behind is the background, if a gap parts it from the thing.
-    size: the larger side of the thing, per unit of its depth.
+    A thing may be as deep as it is wide or high. Larger depths are background, if a gap separates them from the thing. size:
+    the larger side of the thing, per unit of its depth.
     """
     least = _LEAST_SHOWN * len(depths)
     while True:

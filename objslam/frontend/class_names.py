@@ -19,7 +19,7 @@ from objslam.errors import ConfigError
 
 _GAPS = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # The numbers among COCO's 91 that have no class.
 _MOST = 100_000  # The class numbers in a dictionary of names must be below this number. The limit bounds memory.
-_SHOWN = 5  # How many numbers without a name a warning lists. More make a longer line.
+_SHOWN = 5  # The most numbers without a name in a warning. A larger value makes a longer line.
 
 
 def _coco91() -> dict[int, str]:
@@ -27,7 +27,7 @@ def _coco91() -> dict[int, str]:
 
 
 KNOWN: dict[str, dict[int, str]] = {"coco": dict(enumerate(COCO_NAMES)), "coco91": _coco91()}
-"""The lists of class names that are known by a name, each name by its number."""
+"""The known lists of class names, by the name of the list. A list has each class name by its number."""
 
 
 def load_names(given: str, folders: Sequence[Path] = ()) -> dict[int, str]:

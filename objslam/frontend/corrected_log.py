@@ -16,8 +16,8 @@ from objslam.frontend.corrected_odometry import corrected_odometry
 from objslam.frontend.surface_ranges import corrected_ranges
 
 _SQUEEZED = 1e-3
-"""The time (s) next to an end of the path into which frames beyond that end are squeezed. A clock offset may move frames
-there. A larger value moves more frames. With a smaller value, stamps of fast cameras become equal, because float64 resolves
+"""A clock offset may move frames beyond an end of the path. Their stamps are then squeezed into this time (s) next to that
+end. A larger value moves more frames. With a smaller value, stamps of fast cameras become equal, because float64 resolves
 Unix time to 0.2 us."""
 _AHEAD = np.array([[0.0, 0.0, 1.0]])  # The direction along which depths are measured, in the camera frame.
 
@@ -49,10 +49,10 @@ def corrected_mount(base_T_camera: Floats, error: Mapping[str, float], name: str
 
 @lru_cache(maxsize=64)
 def _turn(roll: float, tilt: float, yaw: float) -> Floats:
-    """Return the rotation (3, 3) by the errors `AXES`, rad. It is kept, because derivatives by other errors need the same
-    rotation many times."""
+    """Return the rotation (3, 3) by the errors `AXES`, rad. The result is cached, because derivatives by other errors need
+    the same rotation many times."""
     turn = rotation_from_vector(np.array([roll, tilt, yaw]))
-    turn.setflags(write=False)  # All callers get this array.
+    turn.setflags(write=False)  # All callers share this array.
     return turn
 
 
@@ -72,9 +72,9 @@ def refocused(directions: Floats, errors: Floats | tuple[float, float, float]) -
     """Return unit directions (..., R, 3), corrected by the errors `LENS` of a camera matrix, and their factors (..., R).
 
     The factors are on the standard deviations of the directions. The correction is a linear map M and a projection onto the
-    unit sphere. It multiplies areas on the sphere by det M / |M d|^3 at direction d, and standard deviations by the root.
-    Towards the edge of an image, angles change by less than in its middle. With one factor for all directions, noise at the
-    edge would favour a shorter focal length.
+    unit sphere. It multiplies areas on the sphere by det M / |M d|^3 at direction d, and standard deviations by the root of
+    this factor. Towards the edge of an image, angles change by less than in its middle. With one factor for all directions,
+    noise at the edge would favour a shorter focal length.
 
     directions: (R, 3) unit. errors: (..., R, 3) of each direction, or (3,) of all.
     """
@@ -89,8 +89,8 @@ def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:
     stamps stays.
 
     Stamps that the offset moves beyond an end of the path are squeezed into the millisecond of the path next to that end.
-    There the pose is nearly that of the end. All streams of a camera move alike, so an image keeps the stamp of its boxes.
-    Without a path, the offset is only added.
+    The pose there is nearly the pose at the end. All streams of a camera move alike, so an image and its boxes keep one
+    stamp. Without a path, the offset is only added.
     """
     moved = stamps + clock
     if clock == 0 or path is None:

@@ -25,18 +25,18 @@ _CURVE = 0.5
 """The time (s) over which the curvature of a path is measured. Over a longer time, short curves count less. Over a shorter
 time, the jitter of the headings of fast odometry looks like curves."""
 _STANDS = 1e-6
-"""The least way (m) within `_CURVE`. A shorter way counts as this, because the robot stands or turns on the spot. The value
-only avoids a division by zero."""
+"""The least way (m) within `_CURVE`. A shorter way, of a robot that stands or turns on the spot, is replaced by this value.
+The value only avoids a division by zero."""
 _STROKE = 0.5
 """The time (s) over which moves are summed before a robot is said to drive sideways. Over a longer time, the jitter of poses
 counts less, but a robot that drives to and fro seems to stand."""
 _SHARP = 0.3
-"""The largest turn (rad) of a step that shows whether a robot drives sideways. If the turn is in one half of the step, the
-step seems to go sideways by a quarter of the turn. With a larger turn, coarse odometry looks like driving sideways."""
+"""Only steps with at most this turn (rad) show whether a robot drives sideways. If the whole turn is in one half of a step,
+the step seems to go sideways by a quarter of the turn. With a larger value, coarse odometry looks like driving sideways."""
 _SIDEWAYS = 0.05
-"""The least share of the way of a robot in each direction, if the robot drives sideways. If the way in one direction is 20 %
-too long, the path is 1 % too long, which is within the prior of the other scale. With a larger share, robots that seldom
-drive sideways have no lateral scale."""
+"""A robot drives sideways if each direction has at least this share of its way. If the way in a direction with this share is
+20 % too long, the path is 1 % too long, which is within the prior of the other scale. With a larger share, robots that
+seldom drive sideways have no lateral scale."""
 _KEPT = 6
 """The number of corrected paths that are kept, for the last values of turn scale, biases, slip and lateral scale. A round of
 derivatives needs six: the present path, and one for each error. A larger number takes more memory."""
@@ -56,7 +56,7 @@ class CorrectablePath:
         rotation, places = odometry.poses[:, :3, :3], odometry.poses[:, :3, 3]
         if odometry.travel is None:
             turn = rotation_vector(rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2))[:, 2]  # About the vertical axis.
-        else:  # It may be several rounds.
+        else:  # The turn may be several rounds.
             turn = odometry.travel[1:, 2]
         self._turned = np.append(0.0, np.cumsum(turn))
         self._seconds = odometry.stamps - odometry.stamps[0]
@@ -69,8 +69,8 @@ class CorrectablePath:
     def _curvature(self) -> Floats:
         """(N-1,) rad/m, how sharply the path turns in each step.
 
-        It is the mean over the time `_CURVE` around the middle of the step. So the jitter of headings does not look like
-        curves.
+        The curvature is the mean over the time `_CURVE` around the middle of the step. So jitter of the headings does not
+        look like curves.
         """
         middle, seconds = (self._seconds[1:] + self._seconds[:-1]) / 2, self._seconds
         travel = self.odometry.travel
@@ -105,10 +105,10 @@ class CorrectablePath:
     def drives_sideways(self) -> bool:
         """Whether the robot drives in all directions, as with mecanum wheels, omni wheels or legs. The path must be planar.
 
-        The moves of base are summed over the time `_STROKE`, so the jitter of poses counts little. A base beside the axis of
-        the wheels moves sideways in turns. So the part of the moves that follows the turns does not count. The axes of base
-        may not point along the wheels, so the direction with the least moves counts. In a step with a sharp turn, the
-        heading of the moves is not known.
+        The moves of base are summed over the time `_STROKE`, so the jitter of poses counts little. If base is not on the
+        axis of the wheels, it moves sideways in turns. So the part of the moves that is proportional to the turns does not
+        count. The axes of base may not point along the wheels. So the direction with the least moves counts. Steps with a
+        sharp turn do not count, because the heading of their moves is unknown.
         """
         left_x, left_y = self._left
         x, y, _ = self._ways
@@ -211,7 +211,8 @@ class CorrectablePath:
 def gripping(slip: float, curvature: Floats) -> Floats:
     """Return the ratio (...) of the true length of steps to the length in the odometry, from 0 to 2.
 
-    slip: m/rad, by how much a length is too long for each radian of turning. curvature: (...) rad/m of the path, positive.
+    slip: m/rad, the excess of a length in the odometry for each radian of turning. curvature: (...) rad/m of the path,
+    positive.
     """
     return np.asarray(np.clip(1 - slip * curvature, 0.0, 2.0))
 
@@ -229,7 +230,7 @@ class OdometryCorrection:
     ) -> None:
         """Start a correction. error: the errors by name.
 
-        said, corrected: the path so far, as the robot sent it and after the correction. None at the start of a path.
+        said, corrected: the path so far, as sent by the robot and as corrected. Both are None at the start of a path.
         """
         self._scale, *others = (error.get(name, 0.0) for name in ODOMETRY)
         self._turn_scale, self._turn_bias, self._per_m, self._slip, self._lateral = others
@@ -284,7 +285,7 @@ class OdometryCorrection:
     def _grip(self, stamp: float, turn: float, way: float) -> float:
         """Return what `gripping` does for the step that ends at a stamp, s. turn: rad. way: m.
 
-        The curvature is of the last `_CURVE` seconds, because the steps to come are unknown.
+        The curvature is the mean over the last `_CURVE` seconds, because later steps are unknown.
         """
         if self._slip == 0:
             return 1.0

@@ -50,7 +50,7 @@ def corrected_poses(
         return known, map_T_base, base_T_camera
     map_T_base = poses_near(localization, known.ravel(), max_gap).reshape(*known.shape, 4, 4)
     if keyframes.localized_at is not None:
-        # The odometry carries no pose to a keyframe that it does not reach, as sessions have them.
+        # In a session, the odometry does not reach some keyframes. The odometry carries no pose to such a keyframe.
         reached = True if keyframes.stretch is None else keyframes.stretch >= 0
         localized_at = np.where(reached, keyframes.localized_at, np.nan)
         for at, stamps, error in zip(map_T_base, known, errors, strict=True):
@@ -70,7 +70,7 @@ def corrected_rays(
 
     map_T_base, base_T_camera: (M, K, 4, 4) of each keyframe, not yet corrected for the errors of mounts. camera: (K,) the
     camera of each keyframe, as an index into `names`. rays: not yet corrected. errors: M mappings from the name of an error
-    to its value. The value of an absent name is 0.
+    to its value. An error that is absent is 0.
     """
     turn = rotation_from_vector(_of_cameras(errors, names, AXES))[:, camera]
     move = _of_cameras(errors, names, PLACE)[:, camera]

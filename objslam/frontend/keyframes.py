@@ -111,9 +111,9 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger, measured: Traj
 def _overlap(log: Log, camera: Ints) -> float:
     """Return the share of the images of one moment that can show the same thing. camera: (K,) of each image.
 
-    For each direction that an image shows, take the share of all images that show this direction, this image included. The
-    result is the mean of these shares over all images and directions. A direction stands for a point far away. A camera that
-    moves on the robot counts as if it were at its `base_T_camera`.
+    For each direction that an image shows, the share of all images that show this direction is taken, including the image
+    itself. The result is the mean of the shares over all images and directions. A direction stands for a point far away. A
+    camera that moves on the robot counts as if it were at its `base_T_camera`.
     """
     images = np.bincount(camera, minlength=len(log.cameras)) / len(camera)
     used = np.flatnonzero(images)

@@ -26,21 +26,22 @@ USUAL_PLACE = 0.05
 """The prior standard deviation (m) of the place of a camera along each axis. It fits a place that was measured with a ruler.
 With a larger value, a log must show more before an error counts as known."""
 _PLACE_BESIDE_ODOMETRY = 0.02
-"""The prior standard deviation (m) that replaces `USUAL_PLACE` in joint mode with localisation and odometry. There the poses
-may move, and so take up the effect of a wrong place. In a short live drive, the map was off by 4 cm with this value, and by
-11 cm with `USUAL_PLACE`. For logs with places that were 1.5 cm off, both values gave equally good maps."""
+"""The prior standard deviation (m) that replaces `USUAL_PLACE` in joint mode with localisation and odometry. In this mode,
+the poses may move, and so hide the effect of a wrong place. In a short live drive, the map was off by 4 cm with this value,
+and by 11 cm with `USUAL_PLACE`. For logs with places that were 1.5 cm off, both values gave equally good maps."""
 USUAL_FOCAL = 0.02
 """The prior standard deviation of the focal length, as a share, if the field of view is from a data sheet. A calibrated
 camera errs less. The focal length is estimated only if a localisation or fixed mode gives poses. A path from odometry alone
-bends to fit a wrong focal length, and then a wrong association also fits. One of 36 parts of recorded drives then had four
-landmarks twice. With a larger value, a log must show more before an error counts as known."""
+can bend to fit a wrong focal length, and then a wrong association also fits. When the focal length was also estimated there,
+one of 36 parts of recorded drives had four landmarks twice. With a larger value, a log must show more before an error counts
+as known."""
 COARSE = 0.3
-"""The least noise (m) of fixed poses that reveal no error of a camera. A robot at 1 to 2 m/s drives less than this during
-its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
+"""The least noise (m) at which fixed poses reveal no error of a camera. A robot at 1 to 2 m/s drives less than this distance
+during a clock error of 0.1 s. A larger value calibrates cameras by worse poses."""
 OF_LENGTHS = ("range_scale", "range_offset", "surface", "tag_scale")
 """The errors of measured lengths."""
 _OF_LONG_WAYS = ("odometry.turn_slip", "odometry.turn_per_m")
-"""The errors of wheels that hardly show over short distances."""
+"""The errors of wheels that have hardly any effect over short distances."""
 _CAMERA = ("clock", *AXES, *LENS, "x", "y", "z")
 # Cached, because a run asks for one odometry many times.
 _in_plane = ValuesOfObjects[Trajectory, bool](lambda path: is_planar(path.poses))
@@ -109,8 +110,8 @@ def possible(log: Log, settings: Settings) -> list[str]:
     position have no errors, unless settings.calibration.use is true. Its lens has no errors either, because such poses come
     from images of this lens, or were calibrated with it. Only odometry in the plane slips in curves, or has another scale
     sideways. Odometry in space comes from a camera or a scanner, not from wheels. With a localisation, odometry only leads
-    from one pose to the next. Such short ways hardly show a slip or the difference of two wheels. If these errors were free,
-    wrong associations would fit.
+    from one pose to the next. Such a short way hardly shows a slip or a difference between two wheels. If these two errors
+    were estimated, wrong associations could fit.
     """
     asked, place = settings.calibration.use is True, usual_place(log, settings)
     base = {c.camera.name for c in log.cameras if not asked and np.array_equal(c.camera.base_T_camera, np.eye(4))}

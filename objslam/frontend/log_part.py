@@ -66,7 +66,7 @@ def part_of_log(log: Log, begin: float | None, end: float | None) -> Log:
     if found.robot_path is None and log.robot_path is not None:
         raise _outside("pose", log, log.robot_path.stamps)
     for one, whole in zip(found.cameras, log.cameras, strict=True):
-        if whole.mount is not None and one.mount is None:  # Without poses, it would look like a fixed camera.
+        if whole.mount is not None and one.mount is None:  # Without poses, the camera would look like a fixed camera.
             raise _outside(f"pose of the camera {whole.camera.name}", log, whole.mount.stamps)
     stamps = [one.detections.frame_stamps for one in log.cameras if one.detections is not None]
     left = [one.detections.frame_stamps for one in found.cameras if one.detections is not None]

@@ -1,9 +1,9 @@
 """How far a robot may be from its interpolated path, between two poses of its odometry.
 
-The interpolation assumes a constant velocity from pose to pose. A real robot changes its velocity in between, so it is on
-the interpolated path only at the poses themselves. The error in between is called a bridge. At the share s of a step, a
-random walk that is held at both ends has the variance `wander` * s * (1 - s). The odometry shows how large `wander` is: by
-how much the velocity changes from one step to the next.
+The interpolation assumes a constant velocity from pose to pose. A real robot changes its velocity between two poses, so it
+is on the interpolated path only at the poses. The error of the interpolated path is called a bridge. At the share s of a
+step, a random walk that is held at both ends has the variance `wander` * s * (1 - s). The changes of velocity from one step
+to the next show how large `wander` is.
 """
 
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ from objslam.core.trajectory import Trajectory, usual_seconds
 from objslam.frontend.recent_values import ValuesOfObjects
 
 _SHARED = 1.0
-"""The weight of the mean change of velocity on the whole path, in the estimate for one step. The unit is the weight of one
-change of velocity beside the step. With a larger number, all steps wander more alike. With 0, a robot would never turn
-inside a step whose neighbours have its velocity. On simulated drives, the largest error was six standard deviations with 0,
-and four with 1."""
+"""The weight of the mean change of velocity of the whole path in the estimate for one step. A change of velocity at an end
+of the step has the weight 1. With a larger number, all steps wander more alike. With 0, a robot would never turn inside a
+step whose neighbours have its velocity. On simulated drives, the largest error was six standard deviations with 0, and four
+with 1."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,13 @@ class OdometryBridge:
         Two neighbouring steps of T and U seconds have different mean velocities. If the velocity is white noise of density
         q, their difference has the variance q (1 / T + 1 / U), and the path wanders by q T. If the velocity is a random walk
         of density p, the variances are p (T + U) / 3 and p T^3 s^2 (1 - s)^2 / 3. Over a step, this second variance has the
-        same mean as p T^3 / 15 * s (1 - s), which is used instead. Between a step and the next but one, white noise gives
+        same mean as p T^3 / 15 * s (1 - s), which replaces it here. Between a step and the next but one, white noise gives
         the same variance as between neighbours, and a random walk gives 2.5 times as much. This shows, for each axis, which
         share of the changes is a random walk.
 
         Messages that had to wait arrive together. If they are stamped at arrival, their steps seem to take almost no time,
-        and their velocities mean nothing. So each change is also taken as if no step were shorter than usual, and the
-        smaller change counts.
+        and their velocities mean nothing. So each change is also computed as if no step were shorter than usual, and the
+        smaller of the two changes counts.
         """
         seconds = np.diff(odometry.stamps)[:, None]
         step = log_se3(inverse(odometry.poses[:-1]) @ odometry.poses[1:])

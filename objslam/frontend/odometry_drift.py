@@ -17,7 +17,7 @@ Length = TypeVar("Length", float, Floats)
 def scaled_noise(settings: Settings, error: Mapping[str, float]) -> Settings:
     """Return the settings with the odometry noise for distances that are corrected by the error "odometry.scale".
 
-    The noise of positions grows like the distances. Otherwise a map of another size would fit better or worse.
+    The noise of positions is multiplied like the distances. Otherwise the size of the map would change how well it fits.
     """
     way = 1 + error.get("odometry.scale", 0.0)
     if way == 1:
@@ -116,7 +116,7 @@ class PlanarSteps:
     def sums(self) -> Floats:
         """Return the sums (14, N) up to each pose. `_weights` makes the six elements of the drift from them.
 
-        The variances of a step are linear in its way and its turn, so one set of sums serves any noise.
+        The variances of a step are linear in its way and its turn, so the same sums are valid for any noise.
         """
         cos, sin, x, y = self.cos[1:], self.sin[1:], self.x[1:], self.y[1:]
         sums = np.zeros((14, len(self.x)))

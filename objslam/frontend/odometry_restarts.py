@@ -8,8 +8,8 @@ from objslam.core.rotation import rotation_vector
 _ZERO = 0.05
 """The largest distance (m) and angle (rad) of the odometry from zero after a restart. A larger value finds more restarts."""
 _FAR = 0.1
-"""The least distance (m) or angle (rad) of the odometry from zero before a restart. From a smaller one, a restart changes
-little. A larger value finds fewer restarts."""
+"""The least distance (m) or angle (rad) of the odometry from zero before a restart. From a smaller distance or angle, a
+restart changes little. A larger value finds fewer restarts."""
 
 
 def counts_from_zero(before: Floats, after: Floats) -> Bools:

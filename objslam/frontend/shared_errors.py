@@ -35,12 +35,12 @@ noisy and change abruptly. The clocks of the MRCLAM robots converge in half the 
 _STEP = 0.01
 """The step of each parameter that is not in `_STEPS`, in its unit. The measurements are nearly linear over this step."""
 _MOST_SIGMAS = 6.0
-"""The distance of a parameter's bound from the absolute value of the prior mean, in standard deviations of the prior.
-MOST_SCALE is a second bound of scales. Clocks have their own bound. A larger value lets a parameter move farther from its
-prior."""
+"""A parameter's bound is the absolute value of its prior mean plus this number of standard deviations of its prior.
+MOST_SCALE is a second bound of scales. Clocks have their own bound. With a larger value, a parameter may move farther from
+its prior."""
 _LEAST = 0.1
-"""The least measured range, as a share of the corrected range that it gives. With a larger share, more of the shortest
-ranges become longer than asked. The limit is never reached for things that are farther away than the offset of ranges."""
+"""The least measured range, as a share of the corrected range. With a larger share, more of the shortest ranges become
+longer than asked. The limit is never reached for things that are farther away than the offset of ranges."""
 _KEPT = 9
 """The number of values of the errors for which the poses of the keyframes are kept. A larger number takes more memory. A
 round of derivatives needs seven."""
@@ -101,8 +101,8 @@ class SharedErrors:
         """Return the same measurements with other rays. At values (P,), `at` then returns these unit directions (R, 3) and
         ranges (R,), m.
 
-        Both share the kept poses, which do not depend on the rays. A measured range that an offset would make 0 or less
-        stays positive (`_LEAST`). For such a range, `at` returns a longer one than asked.
+        Both share the kept poses, which do not depend on the rays. If an offset would make a measured range 0 or less, the
+        measured range stays positive (`_LEAST`). In this case, `at` returns a longer range than asked.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
         lens, factors = self._lens(error), range_factors(error, self._half) * (1 + self.noise.shrinkage)
@@ -179,7 +179,7 @@ class SharedErrors:
             base_T_camera[mine] = corrected_mount(mounts, error, one.camera.name)
         gathered, step, wander = keyframes.drift, keyframes.step, keyframes.wander
         if drift and self.log.odometry is not None and keyframes.odom_T_base is not None:
-            # Different clocks may change the order of images, but drift never shrinks from one keyframe to the next.
+            # Different clocks may change the order of images, but drift must not shrink from one keyframe to the next.
             gathered = self._drift(error).gathered(np.maximum.accumulate(poses.known), settings.odometry)
             step, wander = self._correctable().bridge.at(poses.known)
             if keyframes.localized_at is not None and poses.odom_T_base is not None:

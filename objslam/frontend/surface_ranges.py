@@ -85,7 +85,7 @@ def centre_factors(rays: Rays, errors: Mapping[str, float], half: Floats, settin
 
 
 def shares_of(rays: Rays, settings: Settings) -> Floats | float:
-    """Return how far (R,) ranges were lengthened from surfaces to centres, as shares of half the width."""
+    """Return by how much (R,) ranges were lengthened from surfaces to centres, as shares of half the width."""
     return settings.depth.centre if rays.surface is None else rays.surface[:, 0]
 
 
@@ -95,8 +95,8 @@ def weights_of(rays: Rays) -> Floats | float:
 
 
 def with_known_surfaces(rays: Rays, half: Floats, sigma: float) -> Rays:
-    """Return the rays without the error `surface` in their `range_bias`. All things of a log share this error, and it is
-    estimated.
+    """Return the rays without the error `surface` in their `range_bias`. The solve estimates `surface`, which all things of
+    a log share.
 
     half: (R,) as `half_widths`. sigma: the standard deviation of `surface` that `Rays.range_bias` contains.
     """

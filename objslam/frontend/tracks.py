@@ -10,19 +10,19 @@ _LONGEST = 1.0
 """The longest time (s) between two boxes of a track that follow each other. Over a longer time, the robot drives past the
 thing, and the next box is not where the odometry expects it."""
 _NEAR = np.radians(6.0)
-"""The largest angle (rad) between a ray and the ray before it in its track, turned by the odometry. A thing beside the robot
-moves by 5 degrees if the robot drives 8 % of the thing's distance between the images. A larger angle joins neighbours more
-often."""
+"""The largest angle (rad) between a ray and the previous ray of its track, which the odometry turns into the later image. A
+thing beside the robot moves by 5 degrees if the robot drives 8 % of the thing's distance between the images. A larger angle
+joins neighbours more often."""
 _MISS = 5.0
 """The largest angle of a link by ranges, as a multiple of the median angle by which linked rays miss each other (the miss).
-The angle is at least `_LEAST_MISS` and at most `_NEAR`. A range shows where a thing is, and so how it shifts in the image as
-the robot drives. So rays of one track hardly miss each other. The median miss was 0.3 to 0.5 degrees in buildings, 0.9 on
-rough ground, and 2 for a robot that sways on its legs. Some recorded posts stand in groups, 17 cm apart. Among them, 27 % of
-the links joined neighbours with a largest angle of 6 degrees, and 20 % with 3 degrees. A larger multiple joins neighbours
-more often."""
+The angle is at least `_LEAST_MISS` and at most `_NEAR`. A range shows where a thing is, so its shift in the image is
+predictable. So rays of one track hardly miss each other. The median miss was 0.3 to 0.5 degrees in buildings, 0.9 on rough
+ground, and 2 for a robot that sways on its legs. Some recorded posts stand in groups, 17 cm apart. There, 27 % of the links
+joined neighbours if the largest angle was 6 degrees, and 20 % if it was 3 degrees. A larger multiple joins neighbours more
+often."""
 _LEAST_MISS = np.radians(3.0)
 """The lower limit (rad) of the largest angle of a link by ranges. Where wheels slip, rays miss each other by more than
-usual, but the tracks must go on. With 2 degrees, the path in a simulated hotel was bent by 4 m at a slip, and with 3 degrees
+usual, but tracks must not end. With 2 degrees, the path in a simulated hotel was bent by 4 m at a slip, and with 3 degrees
 by 0.2 m. A larger angle joins neighbours more often."""
 _BRIDGED = 0.5
 """The longest time (s) between two boxes of a track if the detector missed the thing between them. Ten robots were
@@ -39,7 +39,7 @@ def associate_tracks(keyframes: Keyframes, rays: Rays) -> Association:
     """Return an association with an object for each track of at least three rays.
 
     Two rays of one label in neighbouring images are linked if each is the nearest one to the other (`_angles`). A detector
-    misses boxes. So a ray without a link is then compared with the image one further back, and so on. Linked rays are a
+    misses boxes. So a ray without a link is then compared with rays of the image before that, and so on. Linked rays are a
     track. Rays of shorter tracks have no object.
 
     keyframes: they must have odometry, which predicts each ray in the next image.
@@ -93,8 +93,8 @@ def _angles(origin: Floats, direction: Floats, range_m: Floats, one: Ints, two: 
 
     A ray with a range ends at a point, and the other ray of the pair misses this point by an angle. If both have a range,
     the smaller angle counts, because one range may be wrong. If none has one, the angle between the directions counts, which
-    is right for a thing far away. A thing that the robot passes moves on by many degrees between two images. Of boxes on
-    shelves beside a robot, 31 % were linked to a neighbour without ranges, and 2 % with ranges.
+    is right for a thing far away. A thing that the robot passes moves by many degrees between two images. Of boxes on
+    shelves beside a robot, 31 % were linked to a neighbour if ranges were not used, and 2 % if they were used.
 
     origin, direction: (R, 3) of the rays. range_m: (R,) m, NaN without one. one, two: (P,) the rays of each pair.
     """

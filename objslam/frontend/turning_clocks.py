@@ -25,9 +25,9 @@ _SURE = 5.0
 begin at an offset that fits by chance. With a larger value, solves for short drives begin at a wrong clock."""
 _TRIGGER, _TRIGGERED = 0.01, 0.9
 """The limits for cameras with a common trigger. At least the share `_TRIGGERED` of their images must follow the previous
-image within `_TRIGGER` (s). The first image of each moment does not count. These images stay together, because found clocks
-have larger errors. A larger time, or a smaller share, takes more cameras for cameras with a trigger, whose frames stay in
-the order of their stamps."""
+image within `_TRIGGER` (s). The first image of each moment does not count. Images of such cameras keep the order of their
+stamps, because found clocks have larger errors than the trigger. With a larger time or a smaller share, more cameras count
+as cameras with a common trigger."""
 
 
 def clocks_of_turns(errors: SharedErrors) -> Floats:
@@ -40,8 +40,8 @@ def clocks_of_turns(errors: SharedErrors) -> Floats:
     wrong optimum, where a large noise of turns explains the effect of the wrong clock.
 
     An interpolated pose has less noise midway between two poses of the odometry, because it averages the noise of both. If
-    the images come at the rate of the odometry, an offset of half a step would therefore fit better. So the mean angle at an
-    offset is raised by the factor by which the noise of the odometry alone would be smaller at this offset.
+    the images come at the rate of the odometry, an offset of half a step would therefore fit better. At some offsets, the
+    noise of the odometry alone is smaller by a factor. The mean angle at such an offset is multiplied by this factor.
     """
     theta, odometry, cameras = errors.mean.copy(), errors.log.odometry, [one.camera.name for one in errors.log.cameras]
     if odometry is None or len(odometry) < 2 or errors.keyframes.odom_T_base is None:
@@ -71,9 +71,9 @@ def in_order_of_clocks(frames: Keyframes, rays: Rays, errors: SharedErrors | Non
     """Return frames in the order in which the images were taken, and the rays with indices into these frames.
 
     Frames are in the order of their stamps. If the clocks of two cameras differ by more than the time between two frames,
-    images that were taken one after the other change places. The path of a graph would then go to and fro, and each way
-    would count as a measurement of its own. Images of cameras with a common trigger stay in the order of their stamps.
-    errors: the shared errors of the frames, None if no clock is estimated.
+    images that were taken one after the other change places. The path of a graph would then go to and fro, and each piece of
+    the path would count as a separate measurement. Images of cameras with a common trigger stay in the order of their
+    stamps. errors: the shared errors of the frames, None if no clock is estimated.
     """
     cameras = () if errors is None else errors.cameras
     if errors is None or len(cameras) < 2:

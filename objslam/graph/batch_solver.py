@@ -123,10 +123,11 @@ def solve_joint(
 
     The solve starts from the poses of the localisation, or from a graph that grew along the odometry. Each solve is followed
     by a test of all rays. Rays far outside the noise of their object are rejected, and other rays return. An object is added
-    or moved if the new poses determine it better. Solve and test repeat until nothing changes. If most rays of a stretch of
-    the drive were rejected, and odometry alone gives the poses, the poses of the stretch may be wrong. In this case, its
-    rays return once. The result is the solution with the lower cost. Images with the same stamp share one pose.
-    Inside the solve, each corner of a fiducial is a landmark, and a factor ties four corners to a square (`graph.tags`).
+    or moved if the new poses determine it better. Solve and test repeat until nothing changes. If odometry alone gives the
+    poses, and most rays of a stretch of the drive were rejected, the poses of the stretch may be wrong. So the rays of the
+    stretch return once. Of the two solutions, the one with the lower cost is the result. Images with the same stamp share
+    one pose. Inside the solve, each corner of a fiducial is a landmark, and a factor ties four corners to a square
+    (`graph.tags`).
 
     Args:
         progress: called as progress(done, total) with numbers of keyframes in the growing graph.
@@ -135,8 +136,8 @@ def solve_joint(
             of nearly the same measurements. If they are given, the rays of rejected stretches do not return.
         errors: the same keyframes and rays as a function of shared errors. If given, the shared errors are estimated. Their
             covariance is added to the covariance of objects.
-        theta: (P,) the values of the shared errors to start from. If None, their mean.
-        hold: whether the shared errors stay at theta. If they stay, the noise stays as well, and no covariance is added.
+        theta: (P,) the first values of the shared errors. If None, the solve starts at their mean.
+        hold: whether the shared errors stay at theta. If so, the noise also stays, and the objects get no added covariance.
 
     Raises:
         SolveError: the linear system is indeterminate, or the cost is not finite.
@@ -227,7 +228,7 @@ class _Solve:
             return found
         attempt = trace.aside() if trace is not None else None
         before, other, again = misfit(found.map_T_camera, found.positions, measured, association), found, back
-        for limit in (1, self._rounds - 1):  # Returned rays that belong to their objects lower the misfit at once.
+        for limit in (1, self._rounds - 1):  # If returned rays belong to their objects, the misfit falls at once.
             begin = measured, association, other.map_T_camera, other.positions, other.used, again
             tried = reject_outliers(*begin, attempt, self._tolerance, limit, other.near, close=True)
             other, again = replace(tried, iterations=other.iterations + tried.iterations), self._nothing
@@ -238,7 +239,8 @@ class _Solve:
         return replace(other, cost_before=found.cost_before)
 
     def _misfit(self, solution: JointSolution) -> float:
-        """Return the misfit of a solution, at the shared errors that fit it best if they are estimated."""
+        """Return the misfit of a solution. If shared errors are estimated, they first get the values that fit the solution
+        best."""
         if self.shared is None:
             return misfit(solution.map_T_camera, solution.positions, self.measured, self.association)
         from objslam.graph.calibration.self_calibration import misfit_at_shared_errors

@@ -3,8 +3,8 @@
 The state is the pose, all landmarks, and errors that all motions share, such as a clock offset. The covariance of the state
 predicts where in a frame each landmark may appear. The rays of a frame are assigned together, because an error of the pose
 shifts all of them. A ray with a range that fits no landmark makes a new landmark. After a long way, drift makes an old
-landmark look new. So recent landmarks are tied to old ones if one drift explains all pairs much better than chance. The time
-for a frame grows with the number of landmarks, and hardly with the number of frames.
+landmark look new. So recent landmarks are tied to old landmarks if one drift explains all pairs much better than chance. The
+time for a frame depends on the number of landmarks, and hardly on the number of frames.
 """
 
 from collections.abc import Callable
@@ -40,18 +40,18 @@ _NEW = 0.2
 _PAIRS = 40
 """The largest number of pairs that are assigned together. A larger number finds rarer assignments, and is slower."""
 _BENT = 0.07
-"""The standard deviation (m), along each axis, of the difference of two estimates of one landmark. It is added to what the
-filter expects. A larger value ties more landmarks, and confuses neighbours more often."""
+"""The standard deviation (m), along each axis, of the difference between two estimates of one landmark. It is added to the
+deviation that the filter expects. A larger value ties more landmarks, and confuses neighbours more often."""
 _TIED = 0.02
-"""The standard deviation (m) of the measurement that ties two landmarks: "they are one point". With a larger value, a closed
-loop corrects the path less."""
+"""The standard deviation (m) of the measurement that two tied landmarks are one point. With a larger value, a closed loop
+corrects the path less."""
 _EXPLAINED = 0.8
 """The least share of rays with a landmark in a reliable exploration. With ranges, the share is 0.86 to 1 in simulated rooms
 and on the log Lost in the Woods. It is 0.4 to 0.65 on the MRCLAM logs, whose landmarks stand 0.18 m apart. With a larger
 limit, fewer explorations are used."""
 _GAIN, _MOST, _LARGEST = 0.05, 100.0, 10.0
-"""How factors on the variances of motions grow if corrections are larger than expected. A correction multiplies a factor by
-1 + `_GAIN` (r - 1). Here r is the ratio of the squared correction to its expectation. `_MOST` is the largest factor, and
+"""Factors on the variances of motions grow if corrections are larger than expected. A correction multiplies a factor by 1 +
+`_GAIN` (r - 1), where r is the ratio of the squared correction to its expectation. `_MOST` is the largest factor, and
 `_LARGEST` the largest r. With larger values, the factors adapt sooner to rough odometry, and also to outliers."""
 
 
@@ -65,7 +65,7 @@ def explore(
 ) -> InitialEstimate:
     """Return poses, landmarks and an association. A ray without a sure match has no landmark.
 
-    The exploration ends as soon as `is_sure` can no longer be true. The rays that are left then have no landmark.
+    The exploration ends as soon as `is_sure` can no longer be true. The remaining rays then have no landmark.
 
     errors: the keyframes and rays as a function of the shared errors. The filter estimates the shared errors, starting from
     their mean. surface: the value of the shared error named surface, which the filter does not estimate. progress: called
@@ -80,7 +80,7 @@ def explore(
 def is_sure(start: InitialEstimate) -> bool:
     """Return whether an exploration explains enough rays for a solve to start from it.
 
-    If not, landmarks of one label probably stand closer together than the error of the odometry.
+    If the result is False, landmarks of one label are probably closer together than the error of the odometry.
     """
     return bool((start.association.object >= 0).mean() >= _EXPLAINED)
 
@@ -233,7 +233,7 @@ class _Exploration:
         self.path[begin : now + 1] = f.map_T_base @ inverse(before) @ self.path[begin : now + 1]
         into = np.arange(len(f))
         into[one] = two
-        while (into[into] != into).any():  # Follow chains of ties to their end.
+        while (into[into] != into).any():  # If a tie leads to a tied landmark, take the end of the chain.
             into = into[into]
         np.add.at(self.hits, into[one], self.hits[one])
         np.maximum.at(self.last, into[one], self.last[one])

@@ -44,8 +44,8 @@ def triangulate_landmarks(
 def flat_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Floats, float, float]:
     """Return the noise of rays as `pose_noise` does, but as if the ground were even. Also return a factor on z.
 
-    On uneven ground, planar poses lack tilts and heights, so rays have more noise along z. If z is multiplied by the factor,
-    the noise of rays is equal in all directions. The factor is `LEVEL` on a flat floor.
+    On uneven ground, planar poses have no tilt and no height, so rays have more noise along z. After z is multiplied by the
+    factor, the noise of rays is equal in all directions. The factor is `LEVEL` on a flat floor.
     """
     yaw, place = noise_of_poses(keyframes, settings)
     uneven = any(noise_up(keyframes, settings))
@@ -55,8 +55,8 @@ def flat_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Fl
 def pose_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Floats, float]:
     """Return the standard deviations (R,), rad, of ray directions, and one standard deviation, m, of all ray origins.
 
-    Both contain the noise of the localisation (`noise_of_poses`), and what planar poses lack on uneven ground (`noise_up`).
-    Without a localisation, only the noise of the rays remains.
+    Both contain the noise of the localisation (`noise_of_poses`), and the unknown tilt and height on uneven ground
+    (`noise_up`). Without a localisation, only the noise of the rays remains.
     """
     angle, place = largest_noise(keyframes, settings)
     return np.hypot(rays.sigma, angle), place
@@ -69,8 +69,8 @@ def largest_noise(keyframes: Keyframes, settings: Settings) -> tuple[float, floa
 
 
 def noise_up(keyframes: Keyframes, settings: Settings) -> tuple[float, float]:
-    """Return the standard deviations of the tilt (rad, for roll and for pitch) and the height (m) that localised planar
-    poses lack on uneven ground. They are 0 for other poses."""
+    """Return the standard deviations of the tilt (rad, of roll and of pitch) and of the height (m) of the base on uneven
+    ground. Localised planar poses do not contain this tilt and height. The standard deviations are 0 for other poses."""
     tilt, z = noise_of_ground(settings)
     if not (tilt or z) or not keyframes.localized_every or not is_planar(keyframes.map_T_base):
         return 0.0, 0.0
@@ -81,7 +81,7 @@ def noise_of_poses(keyframes: Keyframes, settings: Settings) -> tuple[float, flo
     """Return the standard deviations of the headings (rad) and places (m) of localised poses, 0 without a localisation.
 
     Keyframes that share one measured pose share its error. So the variance is multiplied by the number of such keyframes
-    that can show one object. The noise is from the settings, or the larger noise that the log shows.
+    that can show one object. The noise is the noise in the settings or the noise that the log shows, whichever is larger.
     """
     if not keyframes.localized_every:
         return 0.0, 0.0

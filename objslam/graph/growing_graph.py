@@ -32,7 +32,7 @@ class GrowingGraph(ABC):
         self._rebuild: IncrementalRebuild | None = None
         self._newest, self._updates = -1, 0
         self._touched: dict[int, int] = {}  # The last update that involved each landmark.
-        self._outgrown = False  # Whether a variable's letter (of its symbol) is unknown to the present iSAM2.
+        self._outgrown = False  # Whether the present iSAM2 does not know the letter of some variable's symbol.
 
     @abstractmethod
     def refresh(self) -> None:

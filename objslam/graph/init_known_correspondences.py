@@ -18,8 +18,8 @@ from objslam.graph.fixed_pose_triangulation import triangulate_landmarks
 from objslam.graph.sliding_window import SlidingWindow
 
 _ITERATIONS = 4
-"""The largest number of iterations of each solve during growth. Few are enough, because each solve starts near its optimum,
-and the next solve goes on from there. A larger number is slower."""
+"""The largest number of iterations of each solve during growth. A few are enough, because each solve starts near its
+optimum, and the next solve starts at its result. A larger number is slower."""
 _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
 """The limits (rad) on the median angle between rays and landmarks at the predicted poses of a step. Below `_HOLDS`, the next
 step is twice as long. Above `_FAILS`, a shorter step is tried. Larger limits take longer steps. On the MRCLAM logs, all
@@ -30,14 +30,14 @@ median angle of the step. A ray above both limits is an outlier. Larger values a
 in one step is well below both limits."""
 _MORE_RAYS = 1
 """The number of agreeing rays beyond association.min_rays that a new landmark needs. With a larger number, landmarks are
-added later. With a smaller number, false boxes agree by chance too often."""
+added later. With a smaller number, false boxes agree by chance more often."""
 _SHORTEST = 4
 """The number by which joint.grow_step is divided to get the shortest step, which has at least 2 keyframes. A larger number
 allows shorter steps."""
 _AGAIN = 1.05
-"""The factor by which the number of rays of a landmark grows before the landmark is triangulated again. It is for landmarks
-that are not in the graph yet. A larger factor is faster, but landmarks are added later. With a factor of 1, the time grows
-with the square of the number of rays."""
+"""The factor by which the number of rays of a landmark grows before the landmark is triangulated again. Only landmarks that
+are not in the graph yet are triangulated again. A larger factor is faster, but landmarks are added later. With a factor of
+1, the time grows with the square of the number of rays."""
 _RECORDED = 1.02
 """The factor by which the graph grows before the trace records the next step. A larger factor records fewer steps. Each step
 records the whole path, so with a factor of 1 the trace of a long drive would take gigabytes."""
@@ -123,8 +123,8 @@ def _new_landmarks(
 def _may_have_parallax(rays: Rays, owner: Ints, map_T_camera: Floats, settings: Settings) -> Bools:
     """Return a mask (R,) of the rays whose landmark may have enough parallax, or has a ray with a range.
 
-    This quick test saves triangulations that must fail. Two rays differ by at most twice the largest angle between a ray of
-    the landmark and the mean direction of its rays.
+    This quick test avoids triangulations that must fail. The angle between two rays of a landmark is at most twice the
+    largest angle between one of its rays and their mean direction.
     """
     _, directions = rays.in_map(map_T_camera)
     mean = np.zeros((owner.max(initial=-1) + 1, 3))

@@ -1,10 +1,10 @@
 """Initialise poses and landmarks without an association, from odometry alone.
 
-As in `init_known_correspondences`, keyframes are added a few at a time, at poses that continue the solved path by odometry,
-and a sliding window is solved. Each ray is assigned to the known landmark whose predicted bearing it fits, within a gate
-that allows for the odometry's drift. Unassigned rays of recent keyframes give new landmarks, because the drift between these
-keyframes is small. Recent landmarks that are the same as old landmarks close a loop. After a loop closure, the whole graph
-is solved. The result is the start of a global association.
+As in `init_known_correspondences`, keyframes are added a few at a time, and a sliding window is solved. Odometry continues
+the solved path to the new keyframes. A ray is assigned to a known landmark if it fits the landmark's predicted bearing. The
+gate of this test allows for the odometry's drift. Unassigned rays of recent keyframes give new landmarks, because the drift
+between these keyframes is small. Recent landmarks that are the same as old landmarks close a loop. Then the whole graph is
+solved. The result is the start of a global association.
 """
 
 from collections.abc import Callable
@@ -30,9 +30,9 @@ from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.sliding_window import SlidingWindow
 
 HORIZON = 0.1
-"""The drift of the heading (rad, one standard deviation) up to which a landmark is expected at its position. The drift is
-counted since the landmark, or a landmark beside it, was observed. A larger value recognises landmarks after a longer
-absence, and confuses neighbours more often."""
+"""The largest drift of the heading (rad, one standard deviation) at which a landmark is expected at its position. The drift
+counts since the last observation of the landmark, or of a landmark beside it. A larger value recognises landmarks after a
+longer absence, and confuses neighbours more often."""
 _STRETCH = 150
 """The number of latest keyframes that are searched for new landmarks. A larger number is slower and includes more drift."""
 _TURNED = np.radians(4.0)
@@ -56,16 +56,16 @@ _STRAIN = 200.0
 amount closes more wrong loops. On MRCLAM, correct loops raised the cost by up to 110 for each landmark. Wrong loops raised
 it by 240 or more."""
 _LESSON = 50
-"""Half the number of rays with a landmark at which the likelihood ratio of appearances is first learnt. The ratio is learnt
-again each time the number of rays with a landmark has doubled. With a larger number, it is learnt later."""
+"""The likelihood ratio of appearances is first learnt when the number of rays with a landmark is twice this number. The
+ratio is learnt again each time the number of rays with a landmark has doubled. With a larger number, it is learnt later."""
 _AGAIN = 1.05
 """The factor by which the number of rays of a landmark grows before its covariance is computed again. A larger factor is
 faster, and gates stay wider. With a factor of 1, the time grows with the square of the number of rays."""
 _PAIRS = 150
 """The mean number of pairs of landmarks that the search for loops may compare for each keyframe. After a larger search, the
-next one waits for more keyframes. Without a limit, wrong input takes very long, because it gives new landmarks without end.
-A larger number finds loops sooner in logs with many landmarks of one label, and takes longer. The unnamed posts of MRCLAM
-need 45 pairs, and up to 330 pairs with mirrored images."""
+next one waits for more keyframes. Without a limit, a log with wrong data takes very long, because it gives new landmarks
+without end. A larger number finds loops sooner in logs with many landmarks of one label, and takes longer. The unnamed posts
+of MRCLAM need 45 pairs, and up to 330 pairs with mirrored images."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class _Exploration:
         self.refused: set[tuple[tuple[int, ...], tuple[int, ...]]] = set()
         self.pairs_left = 0
         self.ratio: CosineRatio | None = None
-        self.taught = _LESSON  # The number of rays with a landmark from which the ratio was learnt last.
+        self.taught = _LESSON  # How many rays with a landmark there were when the ratio was last learnt.
 
     def run(self, progress: Callable[[int, int], None]) -> InitialEstimate:
         """Explore all keyframes, and return the initial estimate. progress(done, total): gets numbers of keyframes."""
@@ -162,7 +162,7 @@ class _Exploration:
             self._solve()
 
     def _settle(self, whole: bool) -> None:
-        """Compute the covariances of landmarks that have clearly more rays than before. After a solve of the whole graph,
+        """Compute the covariances of landmarks whose number of rays has grown by `_AGAIN`. After a solve of the whole graph,
         compute all covariances."""
         number = np.bincount(self.owner[self.owner >= 0], minlength=len(self.known))
         due = (number >= _AGAIN * self.counted) | whole
@@ -177,8 +177,8 @@ class _Exploration:
         return None if self.ratio is None else Looks.of(self.rays, self.owner, len(self.known), self.ratio)
 
     def _active(self, now: int) -> Bools:
-        """Return for each landmark (N,) whether the heading drifted by less than `HORIZON` since the heading was last known
-        around the landmark."""
+        """Return for each landmark (N,) whether the heading drifted by less than `HORIZON` since the landmark, or a landmark
+        beside it, was last observed."""
         return np.sqrt(self.known.turned(self.heading, now)) < HORIZON
 
     def _recognise(self, new: Ints, begin: int, end: int) -> None:
@@ -189,7 +189,7 @@ class _Exploration:
         some, which, looks = self._some(new, begin), np.flatnonzero(active), self._looks()
         poses = self.window.map_T_camera[begin:end]
         drift = _drifted(self.keyframes, begin - 1, end)
-        # The step is aligned first, because the heading may err by more than the angle between two landmarks.
+        # The step is aligned first, because the error of the heading may be larger than the angle between two landmarks.
         alike = None
         if looks is not None:
             each = np.repeat(np.arange(len(some)), len(which)), np.tile(which, len(some))

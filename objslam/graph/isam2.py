@@ -29,8 +29,8 @@ _SLICE = 30
 """The number of keyframes in one slice of a rebuild. With a larger number, a rebuild ends sooner, and the next image waits
 longer. A slice of 100 keyframes takes 13 ms of a busy core."""
 _FRESH = 10
-"""The number of updates without a landmark after which the landmark counts as deep in iSAM2's tree. A larger number changes
-the layout of the tree less often, and returning landmarks are deeper in the tree."""
+"""A landmark counts as deep in iSAM2's tree after this number of updates without it. A larger number changes the layout of
+the tree less often, and landmarks that are observed again are deeper in the tree."""
 
 
 class IncrementalGraph(GrowingGraph):
@@ -43,9 +43,9 @@ class IncrementalGraph(GrowingGraph):
         super().__init__(settings)
         self._isam = new_isam({})
         self._stale = self._unfinished = False
-        self._replaced: object = None  # The tree before the last rebuild in slices. To free it takes 10 ms.
+        self._replaced: object = None  # The tree before the last rebuild in slices. Its deletion takes 10 ms.
         self._coming = np.zeros(0, dtype=np.int64)  # The landmarks for which the tree was last prepared.
-        self._prepared = True  # Whether the tree has a layout for them. A rebuild in slices ends without one.
+        self._prepared = True  # Whether the tree has a layout for `_coming`. It has none after a rebuild in slices.
         self.rebuilds = 0
 
     def update(self) -> None:
@@ -56,8 +56,8 @@ class IncrementalGraph(GrowingGraph):
     def prepare(self, coming: Ints, relinearise: bool = False) -> None:
         """Add the new variables and factors, and prepare the tree for a keyframe that may observe landmarks `coming` (n,).
 
-        An update eliminates all cliques between an observed variable and the root again. So this call moves the variables
-        that may be observed near to the root. relinearise: whether to also relinearise the variables that changed.
+        An update eliminates again all cliques between an observed variable and the root. So this call moves the variables
+        that may be observed soon closer to the root. relinearise: whether to also relinearise the variables that changed.
         """
         sunk = any(self._touched.get(j, -_FRESH) <= self._updates - _FRESH for j in coming.tolist())
         self._coming = coming
@@ -220,9 +220,9 @@ class IncrementalGraph(GrowingGraph):
 
         The newest keyframe X(k) and the landmarks that it observes make the root. The landmarks `coming` make the clique
         below the root. GTSAM merges a clique into its parent if the clique involves all variables of the parent. The cliques
-        below these two are dense and would be merged. So the root and the clique of `coming` each get a pose that no
-        clique below them involves. The root gets X(k): motions tie it only to X(k-1). The clique of `coming` gets X(k-1):
-        motions tie it to X(k-2).
+        below these two are dense, so GTSAM would merge them. Therefore the root and the clique of `coming` each get a pose
+        that no clique below them involves. The root gets X(k): motions tie it only to X(k-1). The clique of `coming` gets
+        X(k-1): motions tie it to X(k-2).
         """
         chain = [self._newest]
         while len(chain) < 3 and (before := self.before(chain[-1])) is not None:

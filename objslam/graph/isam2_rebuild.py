@@ -13,8 +13,8 @@ _RELINEARISE = (0.02, 0.05)
 """The changes (rad, m) of a variable above which its factors are linearised again. Larger values are faster and less exact.
 A change below these values has no noticeable effect on a bearing."""
 _NEVER = 1_000_000
-"""The number of updates between two automatic relinearisations, so large that none happens. The caller asks for a
-relinearisation when it has time. A smaller number relinearises without a request."""
+"""The number of updates between two automatic relinearisations. It is so large that none happens, because the caller asks
+for a relinearisation when there is time. With a smaller number, iSAM2 relinearises without a request."""
 
 
 def new_isam(others: Mapping[int, gtsam.Pose3 | Floats]) -> gtsam.ISAM2:
@@ -35,8 +35,8 @@ def new_isam(others: Mapping[int, gtsam.Pose3 | Floats]) -> gtsam.ISAM2:
 
 
 class IncrementalRebuild:
-    """The construction of a new iSAM2. It gets the stored factors keyframe by keyframe. At the end, it gets what the old
-    graph got in the meantime.
+    """The construction of a new iSAM2. The new iSAM2 gets the stored factors keyframe by keyframe. At the end, it gets the
+    factors and variables that the old graph got in the meantime.
 
     order: the keyframes in the order in which they are added. The keyframe at the start of a motion comes before the one at
     its end. variables: the linearisation points. isam: the new iSAM2 so far. new: the keys of the variables that came after
@@ -85,8 +85,8 @@ class IncrementalRebuild:
         self.isam.calculateEstimate()  # It raises here if the graph is indeterminate.
 
     def _sort(self) -> None:
-        """Sort the factors by the step that adds them. The first step calls this method. The start of a rebuild does not,
-        because it comes after other work on the same image."""
+        """Sort the factors by the step that adds them. The first step calls this method. The start of a rebuild does not
+        call it, because other work on the same image has already taken time."""
         if self._sorted:
             return
         self._sorted = True

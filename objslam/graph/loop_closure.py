@@ -30,23 +30,23 @@ _SLIPS = (1.0, 3.0, 10.0)
 """Factors on the standard deviations of the drift. A loop is searched once with each factor, because wheels can slip more
 than a Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
 _BESIDE = 0.03
-"""The standard deviation (rad) that the heading gains from one landmark to another landmark that some frame showed beside
-the first. Landmarks about 1 m apart err by 2 or 3 cm. With a smaller value, landmarks are recognised after longer ways
-through the map, though parts of the map may be bent."""
+"""The standard deviation (rad) that a step from a landmark to another landmark adds to the heading, if some frame showed
+both. Landmarks about 1 m apart have relative errors of 2 or 3 cm. With a smaller value, landmarks are recognised after
+longer ways through the map, even if parts of the map are bent."""
 _STEPS = 10
-"""The largest number of landmarks on a way through the map from a known landmark to another. More than ten landmarks add a
-larger variance than an exploration accepts."""
+"""The largest number of landmarks on a way through the map from a known landmark to another. With more than ten landmarks,
+the variance is larger than an exploration accepts."""
 _MORE = 1.5
 """The factor by which the rays of the recent landmark of a pair grow before the pair is compared again. A larger factor is
-faster, and finds loops later. With 1, two landmarks that never match would be compared at each step."""
+faster, and finds loops later. With 1, two landmarks that never match are compared at each step."""
 _EPOCH = 40
-"""The number of consecutive keyframes in an epoch. The drift since an epoch is computed from only one of its keyframes, so a
+"""The number of consecutive keyframes in an epoch. Only one keyframe of an epoch gives the drift since the epoch, so a
 larger number is faster and less exact. A landmark counts as new for this number of keyframes."""
 
 _BENDS = ((0.5, 0.5, 0.1), (2.0, 2.0, 0.5))
 """Standard deviations, in x, y (m) and yaw (rad), of the bends of a solved path that missed a loop. They are chosen, not
-measured. The first bend is a slip, the second a path that was bent to confused landmarks (25 degrees and 2 m in a simulated
-drive). Larger values propose more loops, and a solve judges each loop."""
+measured. The first bend is that of a slip. The second is that of a path with confused landmarks (25 degrees and 2 m in a
+simulated drive). Larger values propose more loops, and a solve judges each loop."""
 _CUTS = 20
 """The largest number of keyframes that divide a path into parts before and after a missed loop. Most keyframes near a loop
 show it, so few are enough. A larger number takes longer."""
@@ -135,8 +135,8 @@ class Landmarks:
     def turned(self, heading: Floats, now: int) -> Floats:
         """Return the variance (N,), rad^2, of the heading at keyframe `now` in the part of the map around each landmark.
 
-        The heading drifts since the last observation of a landmark. If a frame showed another landmark beside it, the other
-        landmark fixes its place. So if the other landmark was observed later, the heading drifts only since that time.
+        The drift counts since the last observation of the landmark. If some frame showed another landmark beside it, the
+        other landmark fixes its place. So if the other landmark was observed later, the drift counts only since that time.
 
         heading: (K,) the variance of the odometry's heading.
         """
@@ -157,7 +157,7 @@ class Closure:
 
     correction: (4, 4) moves the later poses in map to where they should be. now: (P,) the recent landmarks. before: (P,) the
     old landmark of each. evidence: the log odds of the loop. repeated: the log odds of a match of the recent landmarks with
-    others that a frame shows beside them. Such a match is false, and shows that such places repeat (`repetition`).
+    landmarks that a frame shows beside them. Such a match is false. It shows that such places repeat (`repetition`).
     """
 
     correction: Floats
@@ -183,8 +183,8 @@ def find_closure(
     A pair is a recent and an old landmark of one label. A search is made only if it has a new pair, or if the recent
     landmark of a pair has many more rays than at the last search (`_MORE`). A pair counts once for each tried drift.
 
-    Where things repeat, as the doors of a corridor do, recent landmarks also match others that some frame shows beside them.
-    Such matches are certainly false. So a loop also needs its lead over the best false match (`repetition`).
+    Where things repeat, such as doors in a corridor, recent landmarks also match landmarks that a frame shows beside them.
+    Such matches are certainly false. So a loop also needs a lead over the best false match (`repetition`).
 
     window: the solved graph. now: the newest keyframe. looks: what the landmarks look like, None if this is not known.
     """
@@ -230,10 +230,10 @@ def find_closure(
 def find_missed_closures(landmarks: Landmarks, middle: Floats, map_T_camera: Floats, sure: float = np.inf) -> list[Closure]:
     """Return loops that a whole solved path may have missed, with the most evidence first.
 
-    A search during initialisation allows for the drift by the noise of the odometry. Landmarks may be confused after an
-    unlikely slip, which bends the path by more. So this search allows for large bends (`_BENDS`) at keyframes where a
-    landmark is first seen. The landmarks that are seen mostly after this keyframe are matched with landmarks seen mostly
-    before it. The loops are proposals, and a solve must judge them.
+    A search during initialisation allows only for drift by the noise of the odometry. An unlikely slip bends the path by
+    more, and landmarks may be confused after it. So this search allows for large bends (`_BENDS`) at keyframes where a
+    landmark is first seen. Landmarks seen mostly after such a keyframe are matched with landmarks seen mostly before it. The
+    loops are proposals, and a solve must judge them.
 
     middle: (N,) the median keyframe of the rays of each landmark, NaN for landmarks that do not count. map_T_camera: (K, 4,
     4) the solved poses. sure: only closures with at least this evidence get `repeated`. For the others, `repeated` is 0.

@@ -1,9 +1,9 @@
 """Other starts of a joint solve from odometry (multi-start; Martí 2003), and the one that explains the rays best.
 
 A landmark enters the growing graph when its rays have enough parallax. At that time, its position follows from poses by
-odometry alone. If these poses err, the landmark may be metres off. The path bends to its rays, and the solve ends in a local
-minimum, which each later step refines. A graph that grows with less parallax, or with more parallax, adds its landmarks at
-other times. It seldom ends in the same wrong minimum.
+odometry alone. If these poses are wrong, the landmark may be metres off. Its rays then bend the path, and the solve ends in
+a local minimum. Each later step only refines this minimum. A graph that grows with less or more parallax adds its landmarks
+at other times, and seldom ends in the same wrong minimum.
 """
 
 from collections.abc import Callable
@@ -29,16 +29,17 @@ _FEW_RAYS = 1500
 of real drives, the second start ended in the minimum of the first start. The third start then had a better minimum in 7 of
 59 parts with fewer rays, and in 2 of 71 parts with more rays. A larger number makes logs of some minutes slower."""
 _SAME = 0.1
-"""The largest difference of a landmark between two solutions in one minimum, as a share of the size of the map. In wrong
-minima of real drives, at least one landmark differs by a third of the map's size or more. With a larger share, more
-solutions count as equal, so fewer solutions are compared."""
+"""Two solutions are in one minimum if no landmark differs by more than this share of the size of the map. In wrong minima of
+real drives, at least one landmark differs by a third of the map's size or more. With a larger share, more solutions count as
+equal, so fewer solutions are compared."""
 _MOST_RAYS = 6000
-"""The number of rays above which a log begins at one graph only. Such logs are drives of more than a quarter of an hour,
-which see landmarks again and again. No wrong minimum was found in them. A larger number makes long logs slower."""
+"""The number of rays of a log above which its solve starts from one grown graph only. Such logs are drives of more than a
+quarter of an hour, which see landmarks again and again. No wrong minimum was found in them. A larger number makes long logs
+slower."""
 _GROWN = 0.05
-"""The largest difference of a landmark between a grown graph and a known minimum, as a share of the size of the map. A graph
-in a known minimum is not solved. In 170 random parts of real drives, 85 graphs were in a known minimum, and no solve from
-them ended elsewhere. A larger share saves more solves."""
+"""A grown graph is in a known minimum if no landmark differs by more than this share of the size of the map. Such a graph is
+not solved. In 170 random parts of real drives, 85 graphs were in a known minimum, and no solve from them ended elsewhere. A
+larger share saves more solves."""
 _CLEARLY = 3.0
 """The least decrease of the misfit for which another start replaces the first start. The misfit is twice a logarithm of
 odds. A larger value changes the start more rarely."""
@@ -76,7 +77,7 @@ class MultiStart:
                 near = _among(solutions, grown[1], _GROWN)
                 other = found if near else self.solve(*grown, aside)
             except SolveError:
-                continue  # The first solution is there.
+                continue  # A start without a solution is left out, because the first solution remains.
             if not near and not _among(solutions, other.positions, _SAME):
                 solutions.append(other)
                 traces.append(aside)
@@ -117,4 +118,4 @@ def _with_parallax(measured: Measurements, factor: float) -> Measurements:
 
 
 def _silent(done: int, total: int) -> None:
-    """Show no progress: the first growth has shown all of it."""
+    """Show no progress, because the first growth has already shown the whole progress."""

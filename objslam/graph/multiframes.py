@@ -56,8 +56,8 @@ class Multiframes:
     def keyframes(self, images: Keyframes) -> Keyframes:
         """Return the first keyframe of each of the P multiframes, from K images.
 
-        The clocks of the images may have been corrected since the images were joined. Fewer of the returned keyframes share
-        one measurement of the absolute pose, so `localized_every` is smaller.
+        The clocks of the images may have been corrected after the images were joined. One measurement of the absolute pose
+        is shared by fewer multiframes than images, so `localized_every` is smaller.
         """
         if len(self.first) == len(images):
             return images
@@ -76,7 +76,7 @@ class Multiframes:
         path_T_camera = _path(images) @ images.base_T_camera
         poses = inverse(path_T_camera[self.first])[self.number] @ path_T_camera
         own = self.first[self.number] == np.arange(len(images))
-        poses[own] = np.eye(4)  # With rounding errors, all rays would get an offset.
+        poses[own] = np.eye(4)  # With rounding errors here, all rays would get an offset.
         return np.asarray(poses)
 
     def map_T_base(self, images: Keyframes, map_T_camera: Floats) -> Floats:

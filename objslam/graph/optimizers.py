@@ -58,7 +58,7 @@ class Optimum:
 def build_graph(*groups: Sequence[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
     """Return one graph with all factors in their order."""
     graph = gtsam.NonlinearFactorGraph()
-    add = graph.add  # It takes a fifth of the time of push_back, which first tries whether the factor is a graph.
+    add = graph.add  # It takes a fifth of the time of push_back, which first tests whether the factor is a graph.
     for group in groups:
         for factor in group:
             add(factor)
@@ -119,7 +119,7 @@ def levenberg_marquardt(
     except RuntimeError as error:
         raise indeterminate(error) from error
     finally:
-        running.clear()  # The optimizer has the hook. If the hook had the optimizer too, Python could never free them.
+        running.clear()  # The optimizer refers to the hook. A reference back would keep both in memory for ever.
     return Optimum(values, before, optimizer.error(), optimizer.iterations())
 
 

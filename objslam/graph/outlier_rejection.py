@@ -21,14 +21,14 @@ from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.variables import read_poses, with_points
 
 _BESIDE, _MOST = 5, 0.6
-"""When a rejected ray gets a second chance. The stretch of a ray goes from `_BESIDE` rays before it to `_BESIDE` rays after
-it. A rejected ray gets a second chance if at least the share `_MOST` of its stretch is rejected, because the poses of the
-stretch may be wrong. A few false boxes in a row get no second chance. Larger values restore fewer rays."""
+"""The stretch of a ray goes from `_BESIDE` rays before it to `_BESIDE` rays after it. A rejected ray gets a second chance if
+at least the share `_MOST` of the rays in its stretch is rejected, because the poses of the stretch may be wrong. A few false
+boxes in a row get no second chance. Larger values restore fewer rays."""
 ROUNDS = 4
 """The largest number of rounds of solve and test. More rounds are slower, and late rounds change few rays."""
 _COARSE = 1e-4
-"""The decrease of the cost, as a share of the cost, below which an iteration ends a solve before a test of inliers. Robust
-losses converge slowly, and a more exact solution hardly changes an inlier. A larger value is faster."""
+"""A solve before a test of inliers ends if an iteration decreases the cost by less than this share. Robust losses converge
+slowly, and a more exact solution hardly changes which rays are inliers. A larger value is faster."""
 _SURE = 0.95
 """The share of inliers among the rays of an object below which the object is triangulated again. A larger share is slower,
 and corrects more objects at wrong positions."""
@@ -69,10 +69,10 @@ def reject_outliers(
 
     map_T_camera (K, 4, 4) and positions (N, 3): the start. An unknown position is NaN. used: (R,) the inliers of an earlier
     solve, or all False. back: (R,) rays that are inliers in the first solve, whatever the test says. tolerance: the last
-    solve ends if the cost decreases by less than this share. Earlier solves end at `_COARSE`, if that is larger. Inliers of
-    an earlier solve seldom change. So with them, the first solve already ends at `tolerance`. near: the normal equations of
-    a solve on arrays that ended near the start. Solves on arrays use them first. close: whether the start is near the
-    optimum, because it solves nearly the same measurements. If it is near, even the first solve is on arrays.
+    solve ends if the cost decreases by less than this share. Earlier solves end at `_COARSE` if `_COARSE` is larger. If
+    `used` has inliers, the first solve already ends at `tolerance`, because such inliers seldom change. near: the normal
+    equations of a solve on arrays that ended near the start. Solves on arrays use them first. close: whether the start is
+    near the optimum, because it is the solution of nearly the same measurements. If so, even the first solve is on arrays.
     """
     optimum, cost_before, iterations = None, np.nan, 0
     limit = tolerance if used.any() else max(tolerance, _COARSE)
@@ -199,9 +199,9 @@ def second_opinion(
     """Triangulate undetermined objects and objects with outliers again. Keep a new position if more rays agree with it.
 
     Corners of fiducials keep their positions, because four corners of one square are better known than four separate points.
-    An object also keeps its position if at least `enough` (N,) of its rays agree. `enough` is the number of agreeing rays at
-    which an earlier new position was not better. Return the positions (N, 3) m, whether each ray (R,) agrees with its
-    object, and `enough` for the next call.
+    An object also keeps its position if at least `enough` (N,) of its rays agree. With this number of agreeing rays, an
+    earlier new position was not better. Return the positions (N, 3) m, whether each ray (R,) agrees with its object, and
+    `enough` for the next call.
     """
     keyframes, rays = measured.keyframes, measured.rays
     number = np.bincount(association.object[association.object >= 0], minlength=association.count)

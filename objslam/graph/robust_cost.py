@@ -11,8 +11,8 @@ from objslam.core.statistics import STRAY_RAY
 from objslam.core.types import Rays
 
 FLOOR = 0.02
-"""The standard deviation (m) by which rays miss a landmark because the centres of boxes are not one point of the object.
-With a larger value, rays may miss near landmarks by more."""
+"""Rays miss a landmark by this standard deviation (m), because the centres of boxes are not one point of the object. With a
+larger value, rays may miss near landmarks by more."""
 
 
 def truncated_cost(

@@ -18,8 +18,9 @@ _WINDOW = 60
 """The number of earlier keyframes that a step solves again. A larger number is slower and corrects older poses. On the
 MRCLAM robots, windows of 30, 60 and 120 keyframes lead to the same maps."""
 _GROWTH = 2.0
-"""The factor by which the graph grows between two solves of the whole graph. A larger factor is faster. A window ignores
-that the errors of its priors are correlated, and that a loop bends old poses. A smaller factor corrects this sooner."""
+"""The factor by which the graph grows between two solves of the whole graph. A larger factor is faster. A window ignores the
+correlations between the errors of its priors, and the changes of old poses by a loop. A smaller factor corrects both
+sooner."""
 _AT_CAMERA = 1e-3
 """The distance (m) from a camera below which a landmark is wrong and leaves the graph. Below this distance, the information
 of a bearing is so large that the linear system becomes singular. The solver moved landmarks to a camera on real drives whose
@@ -129,8 +130,8 @@ class SlidingWindow:
     def _move(self, begin: int) -> None:
         """Let the window begin at a later keyframe. The marginals of the removed part become priors of the window.
 
-        A landmark that leaves the window keeps its marginal for when it is seen again. If the marginals are indeterminate,
-        nothing changes.
+        A landmark that leaves the window keeps its marginal. The marginal is its prior when the landmark is seen again. If
+        the marginals are indeterminate, nothing changes.
         """
         if begin == self._begin:
             return

@@ -1,7 +1,8 @@
 """Variables of the graph by their symbols: X(k) is the pose of a camera in map, L(j) is the position of object j.
 
 In X(k), k is a keyframe. If images share a pose, k is a multiframe, and X(k) the pose of its first camera. Y(t) is the pose
-of fiducial t. If its size is not known, Z(t) (m) is the first value of half its diagonal minus the present value.
+of fiducial t. If the size of fiducial t is unknown, Z(t) (m) is the first value of half its diagonal minus the present
+value.
 
 A symbol is a letter and a number. A graph may also hold other variables, so variables are found by symbol, never by type.
 """

@@ -24,15 +24,15 @@ from objslam.triangulation.bundle import Bundle
 from objslam.triangulation.point_to_lines import PointSolution, minimise_distances
 
 _VIEW_CAP = 1 - math.cos(math.radians(45))
-"""The solid angle, in units of 2 pi sr, in which wrong boxes are evenly distributed. It is a cone with a half angle of 45
-degrees. With a larger angle, agreement counts as chance more rarely."""
+"""The directions of wrong boxes are assumed to be evenly distributed in this solid angle, in units of 2 pi sr. It is a cone
+with a half angle of 45 degrees. With a larger angle, agreement counts as chance more rarely."""
 _NOISE_SIGMAS = 3.0  # All deviations of a ray below this number of standard deviations score the same.
-_MOST_NOISE = 0.25  # The most that noise covers of the view, as a share. With more, noisy rays agree with any point.
+_MOST_NOISE = 0.25  # The largest share of the view that noise may cover. With more, noisy rays agree with any point.
 _PAIRS_AT_ONCE = {"numpy": 1 << 17, "cpu": 1 << 19, "cuda": 1 << 25}
 """The most pairs of a ray and a hypothesis that are computed together, for each backend. A pair needs 50 bytes of memory.
 Fewer pairs need more calls. In numpy, a consensus with 2^19 pairs took 1.6 times as long as with 2^16 or 2^17, because the
-system gives new memory pages to each array of this size. On an H100, 256,000,000 pairs took 1067 ms with 2^19, 77 ms with
-2^23, 64 ms with 2^25, and 62 ms with 2^29."""
+system allocates new memory pages for each array of this size. On an H100, 256,000,000 pairs took 1067 ms with 2^19, 77 ms
+with 2^23, 64 ms with 2^25, and 62 ms with 2^29."""
 _MAX_ROUNDS = 20  # The most rounds of Eq. 1 and selection. They end early if no selection changes. More are slower.
 
 
@@ -42,10 +42,10 @@ def fit_consensus(
     """Solve Eq. 1 for each object on its agreeing rays. Return the solutions, the agreeing rays (R,) and the log NFA (N,).
 
     Each object has three candidate points: the solution of Eq. 1 on all its rays, the best midpoint of two rays, and a point
-    far ahead, on which nearly parallel rays agree. Midpoints are left out for an object with 2 rays, and if all rays agree
-    with the first point within noise. The search starts at the best candidate. It selects the rays that agree with the
-    point, and solves Eq. 1 on them. It repeats this while the agreement grows. An object without two agreeing rays keeps all
-    its rays.
+    far ahead, with which nearly parallel rays agree. The midpoint is left out if an object has 2 rays, or if all its rays
+    agree with the first point within noise. The search starts at the best candidate. It selects the rays that agree with the
+    point, and solves Eq. 1 on them. It repeats both steps while the agreement grows. An object without two agreeing rays
+    keeps all its rays.
 
     judged: (N,) the objects whose rays certainly do not meet by chance. Such an object keeps all its rays if they all agree
     within noise.
@@ -63,7 +63,7 @@ def fit_consensus(
         candidates.insert(1, pair_point)
     inlier, log_nfa = consensus_about(bundle, xp.stack(candidates, axis=1), bundle.with_rays())
     alone = group_sum(as_type(inlier, log_nfa), bundle.index, len(log_nfa)) < 2
-    whole = alone if judged is None else alone | (fitting & judged)  # A part of few noisy rays may look better by chance.
+    whole = alone if judged is None else alone | (fitting & judged)  # A part of few noisy rays may fit better by chance.
     inlier |= whole[bundle.index]
     for _ in range(_MAX_ROUNDS):
         changed = group_sum(as_type(inlier != used, log_nfa), bundle.index, len(log_nfa)) > 0

@@ -9,8 +9,8 @@ from objslam.core.array_module import Tensor, indices_of
 _SIMILAR = (2, 32)
 """The numbers a and b that limit the sizes of the objects in a block. If the smallest object has n rays, the largest one has
 at most a n + b rays. Fillers make all objects of a block equally long. Larger numbers make fewer blocks with more fillers.
-With 2 and 32, at most about half of a block is fillers. If objects have few rays, the share of fillers is larger, but such a
-block costs little."""
+With 2 and 32, fillers are at most about half of a block. If objects have few rays, fillers are a larger share, but such a
+block takes little time."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Bundle:
         xp = self.xp
         first = xp.cumsum(self.number, 0) - self.number
         objects = objects[xp.argsort(self.number[objects], stable=True)]
-        size = self.number[objects]  # The sizes increase, so the objects that fit into a block follow each other.
+        size = self.number[objects]  # The sizes increase, so the objects of a block are consecutive.
         sizes = size.tolist()
         begin = 0
         while begin < len(sizes):

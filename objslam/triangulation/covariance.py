@@ -34,7 +34,7 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
     tilt = lines.sum((RAYLEIGH_MEAN * rays.sigma**2 * distance / s)[:, None] * rays.direction)
     factor = _variance_factor(length(lines.foot) / s, rays, 3)[:, None, None]
     inverse, regular = _inverse(a, xp)
-    bias = factor * (inverse @ tilt[:, :, None])  # With more noise, the tilt is larger and the Hessian smaller.
+    bias = factor * (inverse @ tilt[:, :, None])  # More noise makes the tilt larger and the Hessian smaller.
     result = factor * inverse @ b @ inverse + bias @ bias.mT
     return xp.where(regular[:, None, None], result, xp.nan)
 
@@ -178,9 +178,9 @@ def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
     """Return the factor (N,), at least 1, by which the variance of the residuals exceeds its expectation.
 
     miss: (R,) normalised residuals. Their mean is used, because it is more robust than their mean square. taken: the number
-    of degrees of freedom that the fit uses up, of 2 n for n rays. The excess over 1 is enlarged, because few remaining
-    degrees of freedom (`rest`) give an uncertain estimate. The enlargement 1 + 3.2 / (rest - 2) is the 95 % quantile of F(3,
-    rest), divided by its limit for a large rest. It is exact to 3 % from 4 rays on.
+    of degrees of freedom that the fit uses up, of 2 n for n rays. The excess over 1 is multiplied by 1 + 3.2 / (rest - 2),
+    because few remaining degrees of freedom (`rest`) give an uncertain estimate. This multiplier is the 95 % quantile of
+    F(3, rest), divided by its limit for a large rest, exact to 3 % from 4 rays on.
     """
     number = as_type(rays.number, miss)
     mean = group_sum(miss, rays.index, len(number)) / number.clip(min=1) / RAYLEIGH_MEAN

@@ -19,13 +19,13 @@ _SINGLE_STEPS = 3
 """The most Newton steps in single precision. They take half the time of steps in double precision. More steps do not make
 the point more exact than single precision allows."""
 _STEPS = 6
-"""The most Newton steps in double precision. An object that needs more has a line through or near its solution."""
+"""The most Newton steps in double precision. If an object needs more steps, a line passes through or near its solution."""
 _LINE_STEPS = 6
 """The number of Newton steps along the nearest line. More steps are more exact and slower."""
 _SHORTER = 0.3
 """The factor by which a step is shortened if it did not lower the cost enough. A larger factor shortens it less."""
 _SINGLE, _DOUBLE = 2.0**-23, 2.0**-52
-"""The relative distance between neighbouring numbers near 1, in single and in double precision."""
+"""The distance between 1 and the next larger number, in single and in double precision."""
 _TINY = 1e-30
 """The least divisor, so that 0 / 0 gives 0."""
 

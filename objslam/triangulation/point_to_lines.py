@@ -33,7 +33,7 @@ long in numpy, and 1.2 times in torch. On CUDA, a ray needs 0.5 kB. On an H100, 
 ms with 2^22 up to 2^26."""
 _ROUNDS = 3
 """The most rounds of `off_nearest_line` for the objects with a line near the solution. `smoothed_newton` solves the rest.
-More rounds leave fewer objects for it."""
+More rounds leave fewer objects for `smoothed_newton`."""
 _FEW = 1 << 16
 """The most rays, with fillers, that `smoothed_newton` solves in numpy instead of torch. `smoothed_newton` needs hundreds of
 calls for each step, and usually solves only a few objects of many thousands. With a larger number, CUDA is called less."""
@@ -110,7 +110,7 @@ def minimise_distances(bundle: Bundle) -> PointSolution:
             point[objects] = (start + step * xp.where(solved, unit, 0.0)).T
             gradient[objects], guess[objects], left[objects] = rest, step.T, ~solved
         number = int(left.sum())
-        # Lines in one plane cross in their solution. Then no round would solve any object.
+        # If the lines of objects are in one plane, they cross in the solution, and no round would solve any object.
         turn = turn + 1 if number < before else _ROUNDS + 1
     return PointSolution(point, determined, gradient, sum(iterations))
 
@@ -140,7 +140,7 @@ def _closed_form(origin: Tensor, direction: Tensor, weight: Tensor, xp: ModuleTy
     origin: (3, n, B) m. direction: (3, n, B) unit. weight: (n, B), 1 for a ray and 0 for a filler.
     """
     number = weight.sum(axis=0)
-    base = (origin * weight).sum(axis=1) / number  # Large map coordinates would cost digits.
+    base = (origin * weight).sum(axis=1) / number  # Large map coordinates would lose digits.
     # One projection is exact enough for squared distances.
     lines = LineBlock(perpendicular(origin - base[:, None], direction), direction, weight, xp)
     matrix, pull = lines.spread(weight), (lines.foot * weight).sum(axis=1)

@@ -1,7 +1,7 @@
 """Find the rays of an object that agree in bearing and range, if the bearings alone give a place far from the ranges.
 
-Bearings from nearly one place meet in every point along them. A box of another thing with the same label may add a wrong
-bearing. This bearing crosses the others somewhere, and only the ranges contradict this place.
+Bearings from nearly one place agree with every point along them. A box of another thing with the same label may add a wrong
+bearing. The wrong bearing crosses the others somewhere, and only the ranges contradict the crossing.
 """
 
 import numpy as np
@@ -15,8 +15,8 @@ _GROSS = 0.3
 the surface of a large thing is nearer than its middle, and a range may end on a thing behind. With a larger share, fewer
 boxes with wrong labels are found."""
 _MOST = 0.5
-"""The share of ranges above which a position is contradicted. The ranges of an object in front of a wall may all be those of
-the wall. With a larger share, fewer boxes with wrong labels are found."""
+"""A position is contradicted if more than this share of ranges contradict it. The ranges of an object in front of a wall may
+all end on the wall. With a larger share, fewer boxes with wrong labels are found."""
 _DROPPED = 0.02
 """The largest share of an object's rays that may be dropped so that the others agree. One ray may always be dropped. A
 detector misreads few labels. With a larger share, ranges to a wall, measured while the robot stood, could outweigh bearings

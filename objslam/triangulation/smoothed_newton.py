@@ -145,7 +145,7 @@ def _exact_optimum(lines: LineBlock, point: Tensor, dual: Tensor, on_line: float
         if newton:
             curvature = full(lines.spread(inverse_d) - outer(u * inverse_d, u, xp))
             point = point - _short_newton(free @ curvature @ free, apply(free, pull), xp)
-    # Each line through the point may add a vector up to 1 long. The vectors with the smallest subgradient are sought.
+    # Each line through the point may add a vector up to 1 long. The vectors that give the smallest subgradient are sought.
     answer = perpendicular(dual, lines.direction) * on
     for _ in range(30 if bool((on > 0).any()) else 0):
         rest = pull + answer.sum(axis=1)

@@ -23,7 +23,7 @@ from objslam.triangulation.point_to_lines import least_squares, minimise_distanc
 from objslam.triangulation.range_consensus import agreeing_with_ranges, contradicted
 
 _LARGE = 200_000
-"""The number of rays from which on CUDA does the work, if there is a card. With fewer rays, numpy on one core is as fast,
+"""The number of rays from which on CUDA is used, if there is a CUDA device. With fewer rays, numpy on one core is as fast,
 because the import of torch takes 1.4 s. Without this import, 20,000 rays took 0.18 s in numpy and 0.08 s on an H100, and
 200,000 rays took 2.0 s and 0.25 s."""
 
@@ -73,9 +73,9 @@ def triangulate(
     An object is ok under three conditions. At least 2 rays agree more closely than by chance. The parallax of the agreeing
     rays and the relative precision meet the limits of the settings. The object lies ahead of most of the agreeing rays. A
     measured range replaces the parallax. Without `settings.consensus`, all rays are used, and chance is not judged. Ranges
-    are fused only for an object whose rays fail the limits, or whose ranges, taken together, are more precise than its rays.
-    Other objects keep the position of Eq. 1, because a range ends on the surface of an object, but its rays meet inside. The
-    result for an object does not depend on other objects or on the order of the rays.
+    are fused only if the rays of an object fail the limits, or if its ranges together are more precise than its rays. Other
+    objects keep the position of Eq. 1, because ranges end on the surface of an object, but rays meet inside. The result for
+    an object does not depend on other objects or on the order of the rays.
 
     Args:
         origins, directions: (R, 3) m, and (R, 3) of any length above 0.
@@ -127,8 +127,9 @@ def _left(
 ) -> Ints:
     """Return the object (R,) of each ray that is triangulated again, -1 for all other rays.
 
-    These are the rays of objects whose bearings lead away from their ranges, without the rays that cause this. m, n: (R, 3)
-    the origins, m, and the unit directions. sigma: (R,) m, the noise of the ranges. Other arguments are as in `triangulate`.
+    Such rays are of objects whose bearings meet far from the ends of their ranges. Rays that cause this error are left out.
+    m, n: (R, 3) the origins, m, and the unit directions. sigma: (R,) m, the noise of the ranges. Other arguments are as in
+    `triangulate`.
     """
     left = np.full(len(index), -1)
     away = np.full(len(index), np.nan)
@@ -209,7 +210,7 @@ def _triangulate(
         here = bundle.index[ranged]
         spreads, biases = (spread_of.object_median(one[ranged], here, count) for one in (spread, bias))
         number = xp.bincount(here, minlength=count).clip(min=1)
-        all_ranges = xp.hypot(spreads / number**0.5, biases)  # The mean of ranges keeps the error that they share.
+        all_ranges = xp.hypot(spreads / number**0.5, biases)  # The error that all ranges share is also in their mean.
         taken = xp.isfinite(fused[:, 0]) & ~(carried & (spread_of.largest_sigma(covariance) <= all_ranges))
         point = xp.where(taken[:, None], fused, point)
         covariance = xp.where(taken[:, None, None], fused_covariance, covariance)
