@@ -7,9 +7,9 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
+from objslam.mapping.bodies.box_heights import with_box_heights
 from objslam.mapping.bodies.boxes_in_front import with_hidden_parts
 from objslam.mapping.bodies.fitting import with_bodies
-from objslam.mapping.bodies.growing_boxes import with_contradicting_growth
 from objslam.mapping.bodies.visible_parts import without_visible_parts
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.depth_axis import check_depth_axis
@@ -123,7 +123,7 @@ def _with_checked_rays(of: DescribedDrive, ledger: Ledger) -> DescribedDrive:
     objects = with_contradicting_ranges(objects, map_T_camera, *used, estimate.weight)
     whole = estimate.weight if solution.hidden is None else np.where(solution.hidden, 0.0, estimate.weight)
     edges = drive.settings.rays.pixel_sigma
-    objects = with_contradicting_growth(objects, map_T_camera, *used, whole, drive.cameras, edges)
+    objects = with_box_heights(objects, map_T_camera, *used, whole, drive.cameras, edges)
     objects = widened(objects, *used, estimate.weight, drive.diagnosis)
     return replace(of, found=replace(of.found, drive=drive), objects=objects)
 
