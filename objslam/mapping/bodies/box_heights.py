@@ -19,6 +19,7 @@ import numpy as np
 from objslam.association.observations import size_per_metre
 from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera
+from objslam.core.geometry import is_planar
 from objslam.core.object_map import ObjectMap
 from objslam.core.statistics import NORMAL_MEDIAN, grouped_median
 from objslam.core.types import Association, Keyframes, Rays
@@ -65,12 +66,15 @@ def with_box_heights(
 ) -> ObjectMap:
     """Return the objects, with wider covariances where the heights of boxes contradict the place.
 
-    If the heights of an object scatter more than usual, its covariance is multiplied by the squared ratio (as the ratio of
-    Birge 1932). If they say that the thing is farther, the covariance also reaches to the place by the heights
+    Only robots on a plane are judged. The views of a camera in the hand rise and sink, so boxes also show the depths of
+    things. If the heights of an object scatter more than usual, its covariance is multiplied by the squared ratio (as the
+    ratio of Birge 1932). If they say that the thing is farther, the covariance also reaches to the place by the heights
     (`_with_growth`). map_T_camera: (K, 4, 4) the solved poses of the cameras at the keyframes. weight: (R,) the weight of
     each ray, 0 for a rejected one and for a box that may be hidden by another box. pixel_sigma: px, the standard deviation
     of the edge of a box.
     """
+    if not is_planar(keyframes.map_T_base):
+        return objects
     held = _used(objects, map_T_camera, keyframes, rays, association, weight, cameras)
     if not len(held):
         return objects
