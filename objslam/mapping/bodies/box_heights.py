@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from objslam.association.observations import size_per_metre
+from objslam.association.observations import MIN_DEPTH, size_per_metre
 from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.geometry import is_planar
@@ -33,8 +33,8 @@ _FEWEST = 8
 _BOXES = 10
 """The fewest boxes from which the scatter of the height of an object is measured. A larger number tests fewer objects."""
 _OTHERS = 5
-"""The fewest objects from which the usual scatter is measured. With fewer objects, `_SCATTER` counts. A larger number has
-`_SCATTER` in more maps."""
+"""The fewest objects from which the usual scatter is measured. With fewer objects, `_SCATTER` counts. With a larger
+number, `_SCATTER` counts in more maps."""
 _SCATTER = 0.07
 """The least usual scatter of heights, in natural logarithms, without the noise of edges. In two simulated flats, things seen
 whole had up to 0.09, and wrong chairs 0.1 to 0.24. With a larger value, fewer objects become wider."""
@@ -76,6 +76,8 @@ def with_box_heights(
     if not is_planar(keyframes.map_T_base):
         return objects
     held = _used(objects, map_T_camera, keyframes, rays, association, weight, cameras)
+    size = size_per_metre(rays.take(held), keyframes, cameras)[:, 1]
+    held, size = held[size > 0], size[size > 0]  # The size is NaN where the lens model has no inverse.
     if not len(held):
         return objects
     places = np.array([np.full(3, np.nan) if one.position is None else one.position for one in objects.objects])
@@ -83,7 +85,7 @@ def with_box_heights(
         association.object[held],
         keyframes.frame_stamps[rays.keyframe[held]],
         rays.in_map(map_T_camera)[0][held],
-        np.log(size_per_metre(rays.take(held), keyframes, cameras)[:, 1]),
+        np.log(size),
         rays.box[held, 3] - rays.box[held, 1],
     )
     times = _scatter(boxes, places, pixel_sigma)
@@ -110,7 +112,7 @@ def _scatter(boxes: _Boxes, places: Floats, pixel_sigma: float) -> Floats:
     """Return the scatter of the heights of each object (N,), as a multiple of the usual scatter. It is 1 for an object with
     few boxes. places: (N, 3) m."""
     owner, count = boxes.owner, len(places)
-    size = boxes.height + np.log(np.linalg.norm(places[owner] - boxes.origins, axis=1))
+    size = boxes.height + np.log(np.maximum(np.linalg.norm(places[owner] - boxes.origins, axis=1), MIN_DEPTH))
     off = size - grouped_median(size, owner, count)[owner]
     # The noise of an edge, px, from the scatter of most boxes. Each of the two edges has it, hence sqrt(2).
     edge = min(float(np.median(np.abs(off) * boxes.side)) / (NORMAL_MEDIAN * np.sqrt(2)), pixel_sigma)
