@@ -36,6 +36,7 @@ def doctor(
     The exit code is 1 if the input has an error that makes the positions of a map unreliable.
     """
     from objslam.core.diagnostics import Ledger
+    from objslam.frontend.boxes.ignored_labels import without_ignored_labels
     from objslam.frontend.boxes.robot_parts import without_robot_parts
     from objslam.frontend.boxes.second_labels import without_second_labels
     from objslam.frontend.known_errors import take_out_expected
@@ -51,7 +52,8 @@ def doctor(
     ledger = Ledger()
     with progress_bar() as show:
         given = read(log, ledger, options)
-        chosen, _ = at_one_clock(with_chosen_poses(given, settings, ledger), settings, ledger)
+        mapped = without_ignored_labels(given, settings, ledger)
+        chosen, _ = at_one_clock(with_chosen_poses(mapped, settings, ledger), settings, ledger)
         chosen = without_robot_parts(chosen, settings, ledger)
         chosen = without_second_labels(chosen, settings, ledger)
         settings = with_mode_of(chosen, settings)

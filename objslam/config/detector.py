@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from objslam.config.section import Count, Device, Finite, Positive, Section, Share
+from objslam.config.section import Count, Device, Finite, Names, Positive, Section, Share
 
 Layout = Literal["ssd", "yolov8", "yolov5", "end_to_end", "yolox", "yolox_decoded", "detr"]
 Role = Literal["boxes", "labels", "scores", "logits", "predictions"]
@@ -35,7 +35,7 @@ class Detector(Section):
     first_label: Annotated[int, Field(ge=0)] | None = None
     """Class number that the model gives to the first name. It is 1 if class 0 is the background and the names omit the
     background."""
-    classes: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    classes: Annotated[Names, Field(min_length=1)] | None = None
     """Names of the classes to keep. null keeps all classes."""
     min_score: Share = 0.25
     """Lowest score of a box that is kept."""

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from objslam.config.section import Count, Device, Finite, NotNegative, Positive, Section, Share
+from objslam.config.section import Count, Device, Finite, Names, NotNegative, Positive, Section, Share
 
 Loss = Literal["l1", "huber", "cauchy", "gnc"]
 
@@ -38,6 +38,9 @@ class RayNoise(Section):
     sensor that measures only bearings. The noise box_sigma is a share of this size. With 0, such an object is a point."""
     min_score: NotNegative = 0.0
     """Lowest score of a box that is used. A box with a lower score is dropped and counted."""
+    ignore_labels: Names = ()
+    """Labels whose boxes are not used, for example [person, dog]. Such boxes are dropped and counted. A label is written as
+    in the log."""
     border: Finite = 1.0
     """Distance in px from the image edge within which a box counts as cut off. The centre of such a box is not the centre of
     its object. So the box gives no ray, and is counted. Its edges are used only for the body of the object. With a negative

@@ -1,5 +1,6 @@
 """Converts the boxes of an image to bearings, from the stored calibrations and mounts of the cameras."""
 
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from objslam.core.camera import Camera, box_sizes, same_lens
 from objslam.core.noise import range_noise
 from objslam.core.types import CameraLog
 from objslam.frontend.bearings import box_rays, parts_of_things, surest
+from objslam.frontend.boxes.ignored_labels import IGNORED_LABELS
 from objslam.frontend.boxes.second_labels import SECOND_LABELS, tells_labels
 from objslam.frontend.corrected_log import corrected_camera, corrected_mount, lens_errors, refocused
 from objslam.frontend.surface_ranges import corrected_ranges, half_widths, range_factors, to_centres
@@ -96,11 +98,12 @@ class BearingExtractor:
         return FrameView(number, mount, base_T_camera, rays)
 
     def _without_repeats(self, frame: FrameMessage, camera: Camera, number: int) -> tuple[FrameMessage, Ints]:
-        """Return the frame without second labels and without boxes of parts of things, and the label numbers of the boxes
-        left.
+        """Return the frame without ignored and second labels and without boxes of parts of things, and the label numbers of
+        the boxes left.
 
         number: the number of the camera.
         """
+        frame = self._without_ignored(frame)
         for name in sorted(set(frame.labels) - self._label_number.keys()):
             self._label_number[name] = len(self._labels)
             self._labels.append(name)
@@ -108,6 +111,14 @@ class BearingExtractor:
         frame, label = _without(self._second_labels(frame, label, camera, number), frame, label)
         measured = frame.boxes, np.zeros(len(frame), dtype=np.int64), label, frame.scores, frame.stamp
         return _without(parts_of_things(*measured, camera, self._settings, self._ledger, frame.whole), frame, label)
+
+    def _without_ignored(self, frame: FrameMessage) -> FrameMessage:
+        """Return the frame without the boxes of labels that the user does not want in the map. Count these boxes."""
+        ignored = self._settings.rays.ignore_labels
+        gone = np.array([name in ignored for name in frame.labels], dtype=bool)
+        for name, count in Counter(name for name in frame.labels if name in ignored).items():
+            self._ledger.drop(IGNORED_LABELS, count, name)
+        return _without(gone, frame, np.zeros(len(frame), dtype=np.int64))[0]
 
     def _second_labels(self, frame: FrameMessage, label: Ints, camera: Camera, number: int) -> Bools:
         """Return which boxes (n,) of the frame give a second label to the thing of another box. Count these boxes."""

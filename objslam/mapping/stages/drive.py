@@ -7,6 +7,7 @@ from objslam.config import Settings
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
+from objslam.frontend.boxes.ignored_labels import without_ignored_labels
 from objslam.frontend.boxes.robot_parts import without_robot_parts
 from objslam.frontend.boxes.second_labels import without_second_labels
 from objslam.frontend.known_errors import take_out_known
@@ -22,9 +23,10 @@ class Drive:
     """A log as a run maps it.
 
     log: the log without the errors that are known or solved. given: the log with these errors, at the chosen poses. It lacks
-    boxes on parts of the robot, and second boxes on one thing. settings: the settings, with the mode that `auto` means for
-    this log. diagnosis: the findings so far. detections, frames: the numbers of recorded boxes and frames. chosen: whether
-    `auto` chose the mode. clock: the clock of the odometry, None if it is the clock of the localisation.
+    boxes of ignored labels, boxes on parts of the robot, and second boxes on one thing. settings: the settings, with the
+    mode that `auto` means for this log. diagnosis: the findings so far. detections, frames: the numbers of recorded boxes
+    and frames. chosen: whether `auto` chose the mode. clock: the clock of the odometry, None if it is the clock of the
+    localisation.
     """
 
     log: Log
@@ -43,7 +45,8 @@ class Drive:
         LogError if the log lacks the chosen poses. ConfigError if calibration.file is wrong or does not fit the log.
         """
         recorded = [c.detections for c in log.cameras if c.detections is not None]
-        given, clock = at_one_clock(with_chosen_poses(log, settings, ledger), settings, ledger)
+        mapped = without_ignored_labels(log, settings, ledger)
+        given, clock = at_one_clock(with_chosen_poses(mapped, settings, ledger), settings, ledger)
         given = without_second_labels(without_robot_parts(given, settings, ledger), settings, ledger)
         of_mode = with_mode_of(given, settings)
         return cls(
