@@ -25,6 +25,8 @@ from objslam.io.calibration_yaml import load_calibration
 USUAL_PLACE = 0.05
 """The prior standard deviation (m) of the place of a camera along each axis. It fits a place that was measured with a ruler.
 With a larger value, a log must show more before an error counts as known."""
+USUAL_PLACES = USUAL_PLACE, USUAL_PLACE
+"""`USUAL_PLACE` for x and y, and for z."""
 _PLACE_BESIDE_ODOMETRY = 0.02
 """The prior standard deviation (m) that replaces `USUAL_PLACE` in joint mode with localisation and odometry. In this mode,
 the poses may move, and so hide the effect of a wrong place. In a short live drive, the map was off by 4 cm with this value,
@@ -55,23 +57,27 @@ def error_names(log: Log) -> tuple[str, ...]:
     return (*odometry, *cameras, *OF_LENGTHS)
 
 
-def usual_place(log: Log, settings: Settings) -> float:
-    """Return the prior standard deviation, m, of the place of a camera on the base, if `calibration.translation` is auto.
+def usual_place(log: Log, settings: Settings) -> tuple[float, float]:
+    """Return the prior standard deviations, m, of the place of a camera on the base, if `calibration.translation` is auto:
+    of x and y, and of z.
 
     At given poses (a localisation, or fixed mode), a wrong place of a camera moves all objects, so the place is estimated. A
-    map from odometry alone simply moves with the camera.
+    map from odometry alone simply moves with the camera. Poses in a plane do not rise to hide a wrong height of a camera.
+    The boxes do not show this height either, so its usual error is in the heights of all objects.
     """
-    if settings.mode == "fixed":
-        return USUAL_PLACE
-    return 0.0 if log.localization is None else USUAL_PLACE if log.odometry is None else _PLACE_BESIDE_ODOMETRY
+    if settings.mode == "fixed" or (log.odometry is None and log.localization is not None):
+        return USUAL_PLACES
+    level = 0.0 if log.localization is None else _PLACE_BESIDE_ODOMETRY
+    path = log.robot_path
+    return level, USUAL_PLACE if path is not None and _in_plane(path) else level
 
 
-def prior_sigma(name: str, settings: Settings, place: float) -> float:
+def prior_sigma(name: str, settings: Settings, place: tuple[float, float] = USUAL_PLACES) -> float:
     """Return the prior standard deviation of an error in the settings, in the unit of the error. It is 0 if the error is
     fixed.
 
     In fixed mode, the errors are estimated from bearings and given poses. So errors of lengths and of odometry are fixed.
-    place: what `usual_place` returns for the log, 0 for a map from odometry alone.
+    place: what `usual_place` returns for the log.
     """
     what, fixed = kind(name), settings.mode == "fixed"
     if fixed and (name in ODOMETRY or what in OF_LENGTHS):
@@ -81,7 +87,7 @@ def prior_sigma(name: str, settings: Settings, place: float) -> float:
     if sigma == "auto" and name in ODOMETRY:
         return 0.0
     if sigma == "auto":
-        return place if setting == "translation" else USUAL_FOCAL * (place > 0)
+        return place[what == "z"] if setting == "translation" else USUAL_FOCAL * (place[0] > 0)
     return float(sigma)
 
 

@@ -88,7 +88,7 @@ class SmallErrors:
         """Return errors with their sizes, in words: errors that the run estimates and that are far larger than their priors.
         "" if there are none."""
         found = zip(self.names, self.values.tolist(), strict=True)
-        far = (n for n, v in found if n in self.estimated and abs(v) > _UNUSUAL * prior_sigma(n, settings, True))
+        far = (n for n, v in found if n in self.estimated and abs(v) > _UNUSUAL * prior_sigma(n, settings))
         return self._words_of(tuple(far))
 
     def _words_of(self, names: Collection[str]) -> str:
@@ -106,7 +106,7 @@ class SmallErrors:
     def remedy(self, settings: Settings) -> str:
         """Return the options with which a run estimates the harmful errors. settings: the settings of a run without these
         options."""
-        held = [kind(name) for name in self.harmful if prior_sigma(name, settings, True) == 0]
+        held = [kind(name) for name in self.harmful if prior_sigma(name, settings) == 0]
         given = dict.fromkeys("translation" if what in ("x", "y") else what for what in held)
         options = ["calibration.use=true", *(f"calibration.{what}={_USUAL[what]}" for what in given if what in _USUAL)]
         return " ".join(f"--set {option}" for option in options)
