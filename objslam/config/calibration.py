@@ -50,8 +50,8 @@ class CalibrationSettings(Section):
     """Rotation error in rad of each camera on the base about the forward axis."""
     translation: Literal["auto"] | NotNegative = "auto"
     """Position error in m of each camera on the base, along each axis. auto: 0.05 in fixed mode, and in joint mode with a
-    localisation alone. 0.02 in joint mode with a localisation and odometry. 0 in joint mode with odometry alone, unless the
-    map shows a gross error. The height has 0.05 in any mode if the robot moves in a plane."""
+    localisation alone. 0.02 in joint mode with a localisation and odometry, but 0.05 for the height if the robot moves in a
+    plane. 0 in joint mode with odometry alone, unless the map shows a gross error."""
     range_scale: NotNegative = 0.02
     """Scale error of all ranges, as a share of the range. Data sheets of depth cameras promise 2 % of the distance. Six
     recorded runs with two kinds of sensors have errors of 1.2 to 2.3 %."""

@@ -63,13 +63,14 @@ def usual_place(log: Log, settings: Settings) -> tuple[float, float]:
 
     At given poses (a localisation, or fixed mode), a wrong place of a camera moves all objects, so the place is estimated. A
     map from odometry alone simply moves with the camera. Poses in a plane do not rise to hide a wrong height of a camera.
-    The boxes do not show this height either, so its usual error is in the heights of all objects.
     """
-    if settings.mode == "fixed" or (log.odometry is None and log.localization is not None):
+    if settings.mode == "fixed":
         return USUAL_PLACES
-    level = 0.0 if log.localization is None else _PLACE_BESIDE_ODOMETRY
-    path = log.robot_path
-    return level, USUAL_PLACE if path is not None and _in_plane(path) else level
+    if log.localization is None:
+        return 0.0, 0.0
+    if log.odometry is None:
+        return USUAL_PLACES
+    return _PLACE_BESIDE_ODOMETRY, USUAL_PLACE if _in_plane(log.localization) else _PLACE_BESIDE_ODOMETRY
 
 
 def prior_sigma(name: str, settings: Settings, place: tuple[float, float] = USUAL_PLACES) -> float:

@@ -85,10 +85,9 @@ def calibrate_at_poses(
 ) -> FixedCalibration:
     """Estimate the shared errors. The search starts at theta (P,).
 
-    An error that the rays do not determine stays at its prior. Too narrow priors also pull the values, so the values are
-    searched again with wider ones (`with_wider_priors`). positions: (N, 3) m, the objects at the start. An object without a
-    position is NaN, and its rays do not count. noise: the noise of the poses. trusted: as in `linearise_points`. SolveError
-    if the linear system has no single solution.
+    An error that the rays do not determine stays at its prior. positions: (N, 3) m, the objects at the start. An object
+    without a position is NaN, and its rays do not count. noise: the noise of the poses. trusted: as in `linearise_points`.
+    SolveError if the linear system has no single solution.
     """
     held = np.append(np.isfinite(positions[:, 0]), False)[association.object]  # Index -1 (no object) takes the last entry.
     number, owner = np.unique(association.object[held], return_inverse=True)
@@ -96,34 +95,24 @@ def calibrate_at_poses(
     if not held.any():
         raise SolveError("no object has a position, so nothing can be calibrated against the poses")
     keyframe = errors.rays.keyframe[held]
-    prior = usual = _inverse(errors.prior)
-    for _ in range(2):  # First with the usual priors, and then with the wider ones, if there are any.
-        for _ in range(_ROUNDS):
-            system = linearise_points(errors, theta, points, owner, held, noise, trusted=trusted)
-            worse = max(system.variance, _dependence(system, keyframe, prior) / system.curvature**2)
-            covariance = _inverse(system.matrix / worse + prior)
-            other = theta - covariance @ (system.vector / worse + prior @ (theta - errors.mean))
-            other = np.clip(other, -errors.bounds, errors.bounds)
-            step, theta = other - theta, other
-            points = points + system.own + system.back @ step
-            if (np.abs(step) < _CONVERGED * np.sqrt(np.diagonal(covariance))).all():
-                break
-        covariance = _inverse(system.matrix / worse + usual)
-        found = Calibration(errors.names, theta, covariance, np.sqrt(np.diagonal(errors.prior)))
-        found = with_wider_priors(found, errors.mean, errors.prior)
-        if found.prior_factor is None:
+    prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
+    for _ in range(_ROUNDS):
+        system = linearise_points(errors, theta, points, owner, held, noise, trusted=trusted)
+        worse = max(system.variance, _dependence(system, keyframe, prior) / system.curvature**2)
+        try:
+            covariance = np.asarray(np.linalg.inv(system.matrix / worse + prior), dtype=np.float64)
+        except np.linalg.LinAlgError as error:
+            raise SolveError(f"the calibration's linear system has no single solution: {error}") from error
+        other = theta - covariance @ (system.vector / worse + prior @ (theta - errors.mean))
+        other = np.clip(other, -errors.bounds, errors.bounds)
+        step, theta = other - theta, other
+        points = points + system.own + system.back @ step
+        if (np.abs(step) < _CONVERGED * np.sqrt(np.diagonal(covariance))).all():
             break
-        prior = usual / np.outer(found.prior_factor, found.prior_factor)
     sensitivity = np.zeros((association.count, 3, len(theta)))
     sensitivity[number] = system.back
-    return FixedCalibration(found, sensitivity)
-
-
-def _inverse(matrix: Floats) -> Floats:
-    try:
-        return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-    except np.linalg.LinAlgError as error:
-        raise SolveError(f"the calibration's linear system has no single solution: {error}") from error
+    found = Calibration(errors.names, theta, covariance, np.sqrt(np.diagonal(errors.prior)))
+    return FixedCalibration(with_wider_priors(found, errors.mean, errors.prior), sensitivity)
 
 
 def noise_of_errors(errors: CalibratedMeasurements, calibration: Calibration) -> Floats:
@@ -163,6 +152,13 @@ def noise_beside_objects(
     every = np.full(len(held), float(np.median(variance)))
     every[held] = variance
     return np.sqrt(every)
+
+
+def turned_by_errors(errors: CalibratedMeasurements, before: Floats, after: Floats) -> Floats:
+    """Return the small angles (M, R), rad, between rays in map at M values `before` (M, P) of the shared errors, and the
+    same rays at the value `after` (P,)."""
+    _, directions, _ = errors.rays_in_map(np.concatenate([after[None], before]))
+    return np.asarray(np.linalg.norm(directions[1:] - directions[0], axis=2))
 
 
 def _batches(number: int, rays: int) -> list[Ints]:

@@ -61,6 +61,7 @@ def calibrate_fixed(
         calibrate_at_poses,
         noise_beside_objects,
         noise_of_errors,
+        turned_by_errors,
     )
     from objslam.graph.fixed_pose_triangulation import largest_noise
 
@@ -96,7 +97,7 @@ def calibrate_fixed(
         )
         at = at.with_noise_of_poses(now.seen.pose_noise)
         allowed = np.hypot(_own(at), told)
-        turned = _turned_by_errors(every, np.array([values for values, _ in earlier]), calibration.values)
+        turned = turned_by_errors(every, np.array([values for values, _ in earlier]), calibration.values)
         if any(
             _rms(angle / before) < SAME and _rms(allowed / before - 1) < SAME
             for angle, (_, before) in zip(turned, earlier, strict=True)
@@ -307,10 +308,3 @@ def _with_covariance(estimate: Estimate, found: FixedCalibration) -> Estimate:
 
 def _parameters(calibration: Calibration) -> Parameters:
     return Parameters(calibration.names, calibration.values, calibration.sigma)
-
-
-def _turned_by_errors(errors: SharedErrors, before: Floats, after: Floats) -> Floats:
-    """Return the small angles (M, R), rad, between rays in map at M values `before` (M, P) of the shared errors, and the
-    same rays at the value `after` (P,)."""
-    _, directions, _ = errors.rays_in_map(np.concatenate([after[None], before]))
-    return np.asarray(np.linalg.norm(directions[1:] - directions[0], axis=2))
