@@ -112,8 +112,7 @@ class Result:
         if self._run is None:
             return None if self.folder is None else read.load_views(self.folder)
         run = self._run.result
-        margins = run.settings.rays.border, run.settings.rays.border_share
-        return None if run.views is None else Views.of(run.views, run.cameras, *margins)
+        return None if run.views is None else Views.of(run.views, run.cameras, run.settings)
 
     @property
     def doubts(self) -> tuple[Doubt, ...]:

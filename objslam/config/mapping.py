@@ -40,7 +40,7 @@ class RayNoise(Section):
     """Lowest score of a box that is used. A box with a lower score is dropped and counted."""
     ignore_labels: Names = ()
     """Labels whose boxes are not used, for example [person, dog]. Such boxes are dropped and counted. A label is written as
-    in the log."""
+    in the log. In a comparison or a merge of maps, this run says nothing about objects with such a label."""
     border: Finite = 1.0
     """Distance in px from the image edge within which a box counts as cut off. The centre of such a box is not the centre of
     its object. So the box gives no ray, and is counted. Its edges are used only for the body of the object. With a negative

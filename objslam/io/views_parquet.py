@@ -1,12 +1,14 @@
 """Read and write views.parquet, the camera poses of all images of a result, including images without a box."""
 
 import io
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
+from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
@@ -16,6 +18,7 @@ from objslam.errors import LogError, OutputError
 from objslam.io.camera_yaml import dump_camera, parse_camera
 
 _CAMERAS, _MARGINS = b"objslam.cameras", b"objslam.margins"  # The keys of the cameras and the margins in the file's header.
+_IGNORED = b"objslam.ignored_labels"  # The key of a JSON list. Older files lack it.
 _BETWEEN = "\n---\n"  # The line between the YAML texts of two cameras.
 
 
@@ -25,7 +28,8 @@ class Views:
 
     stamps: (F,) s, on the clock of the poses. frame_stamps: (F,) s, as in the log, before any correction of a clock. camera:
     (F,) index into `cameras`. map_T_camera: (F, 4, 4) pose of the camera. margin: the setting `rays.border` of the run, px.
-    margin_share: the setting `rays.border_share` of the run.
+    margin_share: the setting `rays.border_share` of the run. ignored: the setting `rays.ignore_labels` of the run. The
+    frames say nothing about objects with such a label.
     """
 
     stamps: Floats
@@ -35,11 +39,14 @@ class Views:
     cameras: tuple[Camera, ...]
     margin: float
     margin_share: float
+    ignored: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, frames: Keyframes, cameras: tuple[Camera, ...], margin: float, margin_share: float) -> Self:
-        """Return the views of `frames`. The other arguments are attributes of the class."""
-        return cls(frames.stamps, frames.frame_stamps, frames.camera, frames.map_T_camera, cameras, margin, margin_share)
+    def of(cls, frames: Keyframes, cameras: tuple[Camera, ...], settings: Settings) -> Self:
+        """Return the views of `frames`. settings: those of the run."""
+        rays = settings.rays
+        told = rays.border, rays.border_share, rays.ignore_labels
+        return cls(frames.stamps, frames.frame_stamps, frames.camera, frames.map_T_camera, cameras, *told)
 
 
 def dump_views(views: Views) -> bytes:
@@ -53,7 +60,8 @@ def dump_views(views: Views) -> bytes:
     cameras = _BETWEEN.join(dump_camera(camera) for camera in views.cameras)
     margins = f"{float(views.margin)!r} {float(views.margin_share)!r}"
     buffer = io.BytesIO()
-    pq.write_table(table.replace_schema_metadata({_CAMERAS: cameras.encode(), _MARGINS: margins.encode()}), buffer)
+    header = {_CAMERAS: cameras.encode(), _MARGINS: margins.encode(), _IGNORED: json.dumps(views.ignored).encode()}
+    pq.write_table(table.replace_schema_metadata(header), buffer)
     return buffer.getvalue()
 
 
@@ -68,6 +76,9 @@ def read_views(file: Path) -> Views:
         texts = header[_CAMERAS].decode().split(_BETWEEN)
         cameras = tuple(parse_camera(text.encode(), str(file), Ledger(), None) for text in texts)
         margin, share = (float(word) for word in header[_MARGINS].decode().split())
+        ignored = json.loads(header.get(_IGNORED, b"[]"))
+        if not isinstance(ignored, list) or not all(isinstance(label, str) for label in ignored):
+            raise ValueError("the ignored labels are not a list of texts")
         stamps = np.asarray(table["stamp"].to_numpy(), dtype=np.float64)
         own = "frame_stamp" if "frame_stamp" in table.column_names else "stamp"  # Older files have one column.
         frame_stamps = np.asarray(table[own].to_numpy(), dtype=np.float64)
@@ -78,6 +89,6 @@ def read_views(file: Path) -> Views:
             raise ValueError("a pose, a stamp or a margin is not valid")
         if len(camera) and not 0 <= camera.min() <= camera.max() < len(cameras):
             raise ValueError("a frame names a camera that is not in the file")
-    except (OSError, pa.ArrowException, AttributeError, KeyError, ValueError, TypeError, LogError) as error:
+    except (OSError, pa.ArrowException, AttributeError, KeyError, ValueError, TypeError, RecursionError, LogError) as error:
         raise OutputError(f"not what a run writes: {str(error).splitlines()[0][:100]}", where=str(file)) from error
-    return Views(stamps, frame_stamps, camera, poses, cameras, margin, share)
+    return Views(stamps, frame_stamps, camera, poses, cameras, margin, share, tuple(ignored))

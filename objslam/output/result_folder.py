@@ -155,7 +155,7 @@ def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, 
     if motions is not None:
         writers[files.MOTIONS] = lambda file: file.write_bytes(dump_motions(motions))
     if result.views is not None:
-        views = Views.of(result.views, result.cameras, result.settings.rays.border, result.settings.rays.border_share)
+        views = Views.of(result.views, result.cameras, result.settings)
         writers[files.VIEWS] = lambda file: file.write_bytes(dump_views(views))
     if truth is not None and truth.objects:
         objects = truth.objects

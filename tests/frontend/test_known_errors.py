@@ -76,7 +76,7 @@ def test_heights_of_a_joint_map_allow_for_a_camera_that_is_higher_than_the_log_s
 
 def test_a_camera_far_from_its_place_is_unusual():
     names = ("front.x", "front.y", "front.yaw")
-    found = SmallErrors(None, names, np.array([0.25, 0.15, 0.01]), np.full(3, 0.01), frozenset(names))  # type: ignore[arg-type]
+    found = SmallErrors(None, names, np.array([0.25, 0.15, 0.01]), np.full(3, 0.01), frozenset(names))
     words = found.unusual(Settings(mode="fixed"))
     assert "front.x" in words
     assert "front.y" not in words

@@ -1,13 +1,12 @@
 """Leave out the boxes of labels that the user does not want in the map, such as persons."""
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Bools, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 
@@ -27,21 +26,16 @@ def without_ignored_labels(log: Log, settings: Settings, ledger: Ledger) -> Log:
     cameras, dropped, boxes = list(log.cameras), Counter[str](), 0
     for i, one in enumerate(log.cameras):
         if one.detections is not None:
-            off = are_ignored(one.detections.label, one.detections.label_names, wanted_out)
-            count = np.bincount(one.detections.label[off], minlength=len(one.detections.label_names)).tolist()
-            dropped.update(dict(zip(one.detections.label_names, count, strict=True)))
+            label, names = one.detections.label, one.detections.label_names
+            off = np.isin(label, [number for number, name in enumerate(names) if name in wanted_out])
+            dropped.update(dict(zip(names, np.bincount(label[off], minlength=len(names)).tolist(), strict=True)))
             cameras[i] = replace(one, detections=one.detections.take(np.flatnonzero(~off))) if off.any() else one
             boxes += len(off)
-    for label, count in dropped.most_common():
-        ledger.drop(IGNORED_LABELS, count, f"{count} of {label}")
+    for name, count in dropped.most_common():
+        ledger.drop(IGNORED_LABELS, count, f"{count} of {name}")
     ledger.drop(IGNORED_LABELS, 0, of=boxes)
     _warn_of_missing(wanted_out, sorted(dropped), ledger)
     return replace(log, cameras=tuple(cameras))
-
-
-def are_ignored(label: Ints, names: Sequence[str], ignored: Collection[str]) -> Bools:
-    """Return which boxes (M,) have an ignored label. label: (M,) index into names."""
-    return np.isin(label, [i for i, name in enumerate(names) if name in ignored])
 
 
 def _warn_of_missing(ignored: Sequence[str], names: list[str], ledger: Ledger) -> None:

@@ -115,6 +115,8 @@ class BearingExtractor:
     def _without_ignored(self, frame: FrameMessage) -> FrameMessage:
         """Return the frame without the boxes of labels that the user does not want in the map. Count these boxes."""
         ignored = self._settings.rays.ignore_labels
+        if not ignored:
+            return frame
         gone = np.array([name in ignored for name in frame.labels], dtype=bool)
         for name, count in Counter(name for name in frame.labels if name in ignored).items():
             self._ledger.drop(IGNORED_LABELS, count, name)

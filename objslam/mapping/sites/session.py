@@ -63,14 +63,18 @@ class Session:
         positions: (N, 3) m.
 
         session_T_map: (4, 4) takes points from the frame of the objects and positions to the frame of this session. The
-        number is 0 for an object without `seen_from`. It is 0 for all objects if the session has no views.
+        number is 0 for an object without `seen_from`, and for one whose label the session ignored. It is 0 for all objects
+        if the session has no views.
         """
         looks = np.zeros(len(objects), dtype=np.int64)
-        known = np.array([o.seen_from is not None for o in objects], dtype=bool)
-        if self.views is None or self.rays is None or not known.any():
+        if self.views is None or self.rays is None:
+            return looks
+        told = [o.seen_from is not None and o.label not in self.views.ignored for o in objects]
+        known = np.array(told, dtype=bool)
+        if not known.any():
             return looks
         turn = session_T_map[:3, :3]
-        some = [(o, o.seen_from) for o in objects if o.seen_from is not None]
+        some = [(o, o.seen_from) for o, use in zip(objects, told, strict=True) if use and o.seen_from is not None]
         extent = np.array([(np.nan, np.nan) if o.extent is None else o.extent for o, _ in some])
         seen = [replace(one, sides=one.sides @ turn.T) for _, one in some]
         here = positions[known] @ turn.T + session_T_map[:3, 3]
