@@ -141,7 +141,9 @@ def diff_results(
         console().print(_changes_table(found))
         say(", ".join(f"{len(found.of(outcome))} {outcome}" for outcome in FATES))
         if found.of("unconfirmed"):
-            say("unconfirmed: only one map has it, and the other drive did not have its place in view")
+            say(
+                "unconfirmed: only one map has it, and the other drive did not have its place in view, or left its label out"
+            )
         if picture is not None:
             say(f"wrote {picture}")
     if not found.registration.accepted:
