@@ -150,7 +150,7 @@ def _validate(data: dict[str, Any], where: str) -> Settings:
         if first["type"] == "extra_forbidden":
             message = f"there is no setting {key}{_meant(key)}"
         else:
-            wrong = f"{first['msg'][0].lower()}{first['msg'][1:]}"
+            wrong = f"{first['msg'][0].lower()}{first['msg'][1:]}".replace("a valid tuple", "a list")
             message = f"{key}: {wrong}, got {_short(first['input'])}"
         raise ConfigError(message, where=where, hint="`objslam config dump` shows every setting") from error
 

@@ -113,6 +113,53 @@ def test_the_sigmas_contain_a_focal_length_that_stays_held(value):
     assert over[1] > 0
 
 
+@pytest.mark.parametrize("height", [-0.09, 0.09])
+def test_the_sigmas_contain_a_wrong_height_of_the_camera(height):
+    """The robot drives on a plane, so all objects are wrong by the same height. A user may say that the height is exact."""
+    log, far = add_shared_errors(drive(2), {"front.z": height}), []
+    for more in ((), ("calibration.translation=0",)):
+        result, _ = run(log, *more)
+        assert "front.z" not in result.calibration.names
+        matches = evaluate(result.map, drive(2).truth, align="se2", radius=1.0).objects.matches
+        assert len(matches) == 10
+        assert max(match.squared_3d for match in matches) < 13.9  # The alignment moves the map down.
+        height_of = {one.label: one.position[2] for one in drive(2).truth.objects}
+        errors = [(one.position[2] - height_of[one.label]) / np.sqrt(one.covariance[2, 2]) for one in result.map.resolved()]
+        far.append(sum(np.abs(errors) > 2.5))
+    assert far[0] == 0
+    assert far[1] >= 5
+
+
+def test_objects_of_one_camera_share_the_error_of_its_height():
+    """The height of one object tells the heights of the others. With two cameras, each object has the error of the cameras
+    that saw it, by the share of their rays."""
+    solution = plainly_solved()
+    whole = with_held_errors(solution.errors, solution, Ledger()).estimate
+    lifted = whole.correlated[:, :, -1]
+    np.testing.assert_allclose(lifted, np.tile([0, 0, 0.05], (len(lifted), 1)), atol=1e-12)
+    camera = (solution.keyframes.stamps > np.median(solution.keyframes.stamps)).astype(np.int64)
+    errors, keyframes = solution.errors, replace(solution.errors.keyframes, camera=camera)
+    one = errors.log.cameras[0]
+    rear = replace(one, camera=replace(one.camera, name="rear"))
+    two = replace(errors, keyframes=keyframes, log=replace(errors.log, cameras=(one, rear)))
+    lifted = with_held_errors(two, solution, Ledger()).estimate.correlated[:, 2, -2:]
+    rays = solution.errors.rays
+    for of in range(solution.association.count):
+        own = solution.association.object == of
+        late = np.average(camera[rays.keyframe[own]], weights=solution.estimate.weight[own])
+        np.testing.assert_allclose(lifted[of], [0.05 * (1 - late), 0.05 * late], atol=1e-12)
+
+
+def test_a_camera_that_is_the_base_has_no_height():
+    solution = plainly_solved()
+    (one,) = solution.errors.log.cameras
+    itself = replace(one, camera=replace(one.camera, base_T_camera=np.eye(4)))
+    errors = replace(solution.errors, log=replace(solution.errors.log, cameras=(itself,)))
+    before = with_held_errors(solution.errors, solution, Ledger()).estimate
+    after = with_held_errors(errors, solution, Ledger()).estimate
+    assert np.allclose(before.covariance[:, 2, 2] - after.covariance[:, 2, 2], 0.05**2)
+
+
 def test_the_sigmas_of_a_right_camera_hardly_grow():
     sigma = []
     for more in ((), ("calibration.focal=0",)):

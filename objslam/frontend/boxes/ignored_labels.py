@@ -34,12 +34,13 @@ def without_ignored_labels(log: Log, settings: Settings, ledger: Ledger) -> Log:
     for name, count in dropped.most_common():
         ledger.drop(IGNORED_LABELS, count, f"{count} of {name}")
     ledger.drop(IGNORED_LABELS, 0, of=boxes)
-    _warn_of_missing(wanted_out, sorted(dropped), ledger)
+    warn_of_missing_labels(wanted_out, sorted(dropped), ledger)
     return replace(log, cameras=tuple(cameras))
 
 
-def _warn_of_missing(ignored: Sequence[str], names: list[str], ledger: Ledger) -> None:
-    """Warn of ignored labels that no box of the log has: a mistyped label would otherwise be mapped silently."""
+def warn_of_missing_labels(ignored: Sequence[str], names: list[str], ledger: Ledger) -> None:
+    """Warn of ignored labels that no box has: a mistyped label would otherwise be mapped silently. names: the labels of all
+    boxes."""
     missing = [label for label in dict.fromkeys(ignored) if label not in names]
     if missing:
         more = ", ..." * (len(names) > _SHOWN)

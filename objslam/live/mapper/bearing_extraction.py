@@ -119,6 +119,7 @@ class BearingExtractor:
             return frame
         gone = np.array([name in ignored for name in frame.labels], dtype=bool)
         for name, count in Counter(name for name in frame.labels if name in ignored).items():
+            self._map.ignored[name] += count
             self._ledger.drop(IGNORED_LABELS, count, name)
         return _without(gone, frame, np.zeros(len(frame), dtype=np.int64))[0]
 

@@ -103,7 +103,7 @@ class MapState:
     frames. pose_covariance: (6, 6) covariance of the newest keyframe's predicted pose, in its camera frame, rad and m,
     rotation first. It is NaN if the odometry does not determine the pose. frames: number of frames of each camera on the
     course. rng: seeded by the settings. robot_parts: the finder of robot parts of each camera, by the camera's number.
-    second_labels: the finder of second labels for all cameras.
+    second_labels: the finder of second labels for all cameras. ignored: the number of boxes of each ignored label.
 
     errors: the shared errors that are corrected in all measurements, by name. calibration: the last estimate of the shared
     errors, at first from the calibration file, or None without either. given: the settings as given. settings: the same
@@ -137,6 +137,7 @@ class MapState:
     changed_cameras: set[str] = field(default_factory=set)
     robot_parts: dict[int, RobotPartFinder] = field(default_factory=dict)
     second_labels: SecondLabelFinder = field(default_factory=SecondLabelFinder)
+    ignored: Counter[str] = field(default_factory=Counter)
     errors: dict[str, float] = field(default_factory=dict)
     calibration: Calibration | None = None
 

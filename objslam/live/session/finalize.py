@@ -17,6 +17,7 @@ from objslam.core.result import RunResult
 from objslam.core.trajectory import Trajectory, correct_path
 from objslam.core.types import Log
 from objslam.errors import SolveError
+from objslam.frontend.boxes.ignored_labels import warn_of_missing_labels
 from objslam.frontend.known_errors import warn_of_others
 from objslam.frontend.localization.odometry_clock import warn_of_two_clocks
 from objslam.live.calibration.collected import Collected, collect
@@ -50,6 +51,7 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
     """
     begin = time.perf_counter()
     ledger, found = m.counters.ledger, collect(m, name)
+    warn_of_missing_labels(m.given.rays.ignore_labels, sorted({*m.labels, *m.ignored}), ledger)
     if not len(found.rays):
         raise _nothing_mapped(m, name)
     solved = _solved_drive(found, _checked(m, found, name), m.by_label, ledger)
