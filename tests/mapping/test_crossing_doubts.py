@@ -9,9 +9,11 @@ import pytest
 from doubtful_drives import clean_rooms
 
 from objslam.association.crossings.one_or_two import find_crossings
-from objslam.core.result import RunResult
+from objslam.core.result import RunResult, doubtful_ids
 from objslam.mapping.doubts import disagreeing
 from objslam.mapping.doubts.evidence import evidence_of
+from objslam.mapping.doubts.find import with_doubts
+from objslam.mapping.doubts.rare import rarely_seen
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +42,32 @@ def test_an_object_is_doubted_if_it_is_more_likely_not_one_thing(rooms, monkeypa
     found = disagreeing.crossing(result, evidence)
     named = [result.map.objects[evidence.object[landmark[k]]].id for k in (2, 0)]  # The likeliest crossing comes first.
     assert [doubt.objects for doubt in found] == [(number,) for number in named]
-    assert [doubt.numbers["probability"] for doubt in found] == pytest.approx([0.9 / (1 + np.exp(2)), 0.45])
+    assert [1 - doubt.numbers["probability"] for doubt in found] == pytest.approx([0.9 / (1 + np.exp(2)), 0.45])
+    assert doubtful_ids(found, ["split"]) == set(named)  # The pictures mark them.
     assert len(disagreeing.in_assessment(found)) == 1
     known = tuple(replace(o, existence=None) for o in objects)  # Names that are given say nothing of existence.
     found = disagreeing.crossing(replace(result, map=replace(result.map, objects=known)), evidence)
     assert [doubt.numbers["log_odds"] for doubt in found] == pytest.approx([2.0])
+
+
+def test_an_object_that_too_few_frames_show_is_doubted(rooms):
+    """The lowest existence comes first. An object of a clean drive has no such doubt."""
+    assert rarely_seen(rooms) == []
+    existence = dict(zip((o.id for o in rooms.map.objects[:3]), (0.79, 0.81, 0.55), strict=True))
+    objects = tuple(replace(o, existence=existence.get(o.id, o.existence)) for o in rooms.map.objects)
+    result = replace(rooms, map=replace(rooms.map, objects=objects))
+    low, _, lowest = (o.id for o in objects[:3])
+    found = rarely_seen(result)
+    assert [one.objects for one in found] == [(lowest,), (low,)]
+    whole = with_doubts(result)
+    named = [one for one in whole.doubts if one.reason == "rarely seen"]
+    assert {one.objects for one in named} == {(lowest,), (low,)}
+    assert whole.summary["doubtful_objects"] == with_doubts(rooms).summary["doubtful_objects"] + 2
+    (said,) = [one for one in whole.summary["assessment"]["reasons"] if "may be no thing" in one]
+    assert said.startswith("2 objects are missing in too many frames that should show them (")
+
+
+@pytest.mark.parametrize("existence", [None, 0.8, 1.0])
+def test_an_object_that_enough_frames_show_is_not_doubted(rooms, existence):
+    objects = tuple(replace(o, existence=existence) for o in rooms.map.objects)
+    assert rarely_seen(replace(rooms, map=replace(rooms.map, objects=objects))) == []

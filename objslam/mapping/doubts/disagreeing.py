@@ -77,7 +77,7 @@ def crossing(result: RunResult, evidence: Evidence) -> list[Doubt]:
                 o.position,
                 evidence.ray[np.flatnonzero(mine)],
                 {
-                    "probability": float(one[s]),
+                    "probability": 1 - float(one[s]),
                     "log_odds": -float(found.odds[s]),
                     "rays": number - second,
                     "other_rays": second,

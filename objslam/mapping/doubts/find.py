@@ -12,6 +12,7 @@ from objslam.core.result import DOUBT_KINDS, LIKELY, Doubt, RunResult, doubtful_
 from objslam.core.statistics import grouped_median
 from objslam.mapping.doubts import cut_things as cut_off
 from objslam.mapping.doubts import disagreeing as apart
+from objslam.mapping.doubts import rare as seldom
 from objslam.mapping.doubts import unsure as wide
 from objslam.mapping.doubts.evidence import Evidence, evidence_of
 from objslam.mapping.doubts.groups import REASONS, BoxGroups, Reason, find_groups
@@ -89,7 +90,8 @@ def with_doubts(result: RunResult) -> RunResult:
     a place is in the map twice, or most objects have a wide sigma.
 
     A map is also not called good if too many things are doubtful (`_are_few`). A thing counts if the rays of an object do
-    not agree on one thing, if an object has many sizes, or if the robot drove through an object. It counts if two objects
+    not agree on one thing, if too few frames show an object, if an object has many sizes, or if the robot drove through an
+    object. It counts if two objects
     are likely one thing that moved, or if many boxes of a label meet where the map has no object. If few things count, the
     assessment only names them.
 
@@ -104,6 +106,8 @@ def with_doubts(result: RunResult) -> RunResult:
     cut = cut_off.cut_things(result)
     unmapped, told = unmapped_labels(result, evidence, cut), {one.label for one in doubts if one.kind == "boxes"}
     disagreeing = [*apart.crossing(result, evidence), *apart.disagreeing(result, apart.misfits_of(result))]
+    called = {one.objects for one in (*doubts, *disagreeing) if one.kind == "split"}
+    rare = [one for one in seldom.rarely_seen(result) if one.objects not in called]
     through = passed.driven_through(result)
     paired = {one.objects for one in doubts if one.kind == "pair"}
     elsewhere = moved.at_other_places(result, evidence.state, evidence.object)
@@ -118,6 +122,7 @@ def with_doubts(result: RunResult) -> RunResult:
         *unsure,
         *cut_off.in_doubts(cut, result),
         *_unnamed(disagreeing, doubts),
+        *rare,
         *through,
         *elsewhere,
         *for_a_time,
@@ -131,14 +136,14 @@ def with_doubts(result: RunResult) -> RunResult:
     doubles = int((found.pairs.probability >= LIKELY).sum()) + sum(_of_one_label(one, result) for one in filling)
     if "assessment" in summary:
         lost, named = _of_lost_things(found.groups, result), wide.in_assessment(unsure, result)
-        odd = {j for one in (*disagreeing, *mixed, *through, *elsewhere) for j in one.objects}
+        odd = {j for one in (*disagreeing, *rare, *mixed, *through, *elsewhere) for j in one.objects}
         few = _are_few(len(odd), len(lost), result)
         if wide.are_most(unsure, result):
             lost, named, few = [*named, *lost], [], False
         twice = find_twice(result.map)
         whole = [*([twice.in_words()] if twice else []), *_of_doubles(doubles)]
         of_objects = [*passed.in_assessment(through), *moved.in_assessment(elsewhere)]
-        of_objects += [*apart.in_assessment(disagreeing), *_of_mixed(len(mixed))]
+        of_objects += [*apart.in_assessment(disagreeing), *seldom.in_assessment(rare), *_of_mixed(len(mixed))]
         assessment = _assessed(summary["assessment"], *((whole, []) if few else ([*whole, *of_objects], lost)))
         if few:
             assessment = _praised(assessment, len(odd), len(result.map.resolved()))
