@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _TITLES: dict[DoubtKind, str] = {
     "pair": "objects that may be one",
-    "split": "objects that may be two",
+    "split": "objects that may be several things, or none",
     "moved": "objects that were there for a time",
     "unresolved": "objects without a position",
     "unsure": "objects with a wide sigma",
