@@ -13,7 +13,6 @@ from objslam.core.result import RunResult, doubtful_ids
 from objslam.mapping.doubts import disagreeing
 from objslam.mapping.doubts.evidence import evidence_of
 from objslam.mapping.doubts.find import with_doubts
-from objslam.mapping.doubts.rare import rarely_seen
 
 
 @pytest.fixture(scope="module")
@@ -52,12 +51,12 @@ def test_an_object_is_doubted_if_it_is_more_likely_not_one_thing(rooms, monkeypa
 
 def test_an_object_that_too_few_frames_show_is_doubted(rooms):
     """The lowest existence comes first. An object of a clean drive has no such doubt."""
-    assert rarely_seen(rooms) == []
+    assert disagreeing.rarely_seen(rooms) == []
     existence = dict(zip((o.id for o in rooms.map.objects[:3]), (0.79, 0.81, 0.55), strict=True))
     objects = tuple(replace(o, existence=existence.get(o.id, o.existence)) for o in rooms.map.objects)
     result = replace(rooms, map=replace(rooms.map, objects=objects))
     low, _, lowest = (o.id for o in objects[:3])
-    found = rarely_seen(result)
+    found = disagreeing.rarely_seen(result)
     assert [one.objects for one in found] == [(lowest,), (low,)]
     whole = with_doubts(result)
     named = [one for one in whole.doubts if one.reason == "rarely seen"]
@@ -70,4 +69,4 @@ def test_an_object_that_too_few_frames_show_is_doubted(rooms):
 @pytest.mark.parametrize("existence", [None, 0.8, 1.0])
 def test_an_object_that_enough_frames_show_is_not_doubted(rooms, existence):
     objects = tuple(replace(o, existence=existence) for o in rooms.map.objects)
-    assert rarely_seen(replace(rooms, map=replace(rooms.map, objects=objects))) == []
+    assert disagreeing.rarely_seen(replace(rooms, map=replace(rooms.map, objects=objects))) == []

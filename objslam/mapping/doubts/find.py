@@ -12,7 +12,6 @@ from objslam.core.result import DOUBT_KINDS, LIKELY, Doubt, RunResult, doubtful_
 from objslam.core.statistics import grouped_median
 from objslam.mapping.doubts import cut_things as cut_off
 from objslam.mapping.doubts import disagreeing as apart
-from objslam.mapping.doubts import rare as seldom
 from objslam.mapping.doubts import unsure as wide
 from objslam.mapping.doubts.evidence import Evidence, evidence_of
 from objslam.mapping.doubts.groups import REASONS, BoxGroups, Reason, find_groups
@@ -107,7 +106,7 @@ def with_doubts(result: RunResult) -> RunResult:
     unmapped, told = unmapped_labels(result, evidence, cut), {one.label for one in doubts if one.kind == "boxes"}
     disagreeing = [*apart.crossing(result, evidence), *apart.disagreeing(result, apart.misfits_of(result))]
     called = {one.objects for one in (*doubts, *disagreeing) if one.kind == "split"}
-    rare = [one for one in seldom.rarely_seen(result) if one.objects not in called]
+    rare = [one for one in apart.rarely_seen(result) if one.objects not in called]
     through = passed.driven_through(result)
     paired = {one.objects for one in doubts if one.kind == "pair"}
     elsewhere = moved.at_other_places(result, evidence.state, evidence.object)
@@ -138,12 +137,13 @@ def with_doubts(result: RunResult) -> RunResult:
         lost, named = _of_lost_things(found.groups, result), wide.in_assessment(unsure, result)
         odd = {j for one in (*disagreeing, *rare, *mixed, *through, *elsewhere) for j in one.objects}
         few = _are_few(len(odd), len(lost), result)
+        lost = [*apart.rare_in_assessment(rare), *lost]
         if wide.are_most(unsure, result):
             lost, named, few = [*named, *lost], [], False
         twice = find_twice(result.map)
         whole = [*([twice.in_words()] if twice else []), *_of_doubles(doubles)]
         of_objects = [*passed.in_assessment(through), *moved.in_assessment(elsewhere)]
-        of_objects += [*apart.in_assessment(disagreeing), *seldom.in_assessment(rare), *_of_mixed(len(mixed))]
+        of_objects += [*apart.in_assessment(disagreeing), *_of_mixed(len(mixed))]
         assessment = _assessed(summary["assessment"], *((whole, []) if few else ([*whole, *of_objects], lost)))
         if few:
             assessment = _praised(assessment, len(odd), len(result.map.resolved()))
