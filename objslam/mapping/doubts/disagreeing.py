@@ -17,10 +17,10 @@ _ONE_THING = 0.5
 """The probability of being one thing below which an object is doubted. It concerns objects at which the rays of two things
 may cross. With a larger value, fewer maps are good."""
 _EXISTS = 0.8
-"""The existence below which an object is doubted. In 18 runs on twelve simulated flats, from which it was chosen, 11 of 14
-such objects were false, and two of the other three were inside their 95 % ellipsoids. Of 14 objects with 0.8 to 0.9, two
-were false. In a recorded office, 8 of 40 objects were below it: among them a refrigerator that is none and a second bottle at one place, but
-also a real monitor. With a larger value, more objects are doubted."""
+"""The existence below which an object is doubted. It was chosen from 18 runs on twelve simulated flats: 11 of 14 objects
+below it were false, and two of the other three were inside their 95 % ellipsoids. Of 14 objects with 0.8 to 0.9, two were
+false. In a recorded office, 8 of 40 objects were below it: among them a refrigerator that is none and a second bottle at
+one place, but also a real monitor. With a larger value, more objects are doubted."""
 
 
 def misfits_of(result: RunResult) -> Misfits:
