@@ -61,7 +61,9 @@ def test_an_object_that_too_few_frames_show_is_doubted(rooms):
     whole = with_doubts(result)
     named = [one for one in whole.doubts if one.reason == "rarely seen"]
     assert {one.objects for one in named} == {(lowest,), (low,)}
-    assert whole.summary["doubtful_objects"] == with_doubts(rooms).summary["doubtful_objects"] + 2
+    assert doubtful_ids(named, ["split"]) == {lowest, low}  # The pictures mark them.
+    # They do not make a map bad, and do not start a solve of the poses, because they are no sign of wrong poses.
+    assert whole.summary["doubtful_objects"] == with_doubts(rooms).summary["doubtful_objects"]
     (said,) = [one for one in whole.summary["assessment"]["reasons"] if "may be no thing" in one]
     assert said.startswith("2 objects are missing in too many frames that should show them (")
 

@@ -16,6 +16,8 @@ _NAMED = 3
 _ONE_THING = 0.5
 """The probability of being one thing below which an object is doubted. It concerns objects at which the rays of two things
 may cross. With a larger value, fewer maps are good."""
+RARELY_SEEN = "rarely seen"
+"""The reason of a doubt about an object that too few frames show."""
 _EXISTS = 0.8
 """The existence below which an object is doubted. It was chosen from 18 runs on twelve simulated flats: 11 of 14 objects
 below it were false, and two of the other three were inside their 95 % ellipsoids. Of 14 objects with 0.8 to 0.9, two were
@@ -101,7 +103,7 @@ def rarely_seen(result: RunResult) -> list[Doubt]:
         found.append(
             Doubt(
                 "split",
-                "rarely seen",
+                RARELY_SEEN,
                 o.label,
                 f"{o.label} #{o.id} may be no thing, but a place where rays of several things meet: too few of the frames "
                 f"that should show it do. The probability that it exists is {o.existence:.2g}.",

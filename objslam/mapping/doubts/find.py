@@ -176,8 +176,11 @@ def maps_things_twice(result: RunResult) -> bool:
 
 
 def _doubtful_objects(doubts: tuple[Doubt, ...], result: RunResult) -> int:
-    """Return the number of objects with a position that are likely doubles, or may be several things or at a wrong place."""
-    named = doubtful_ids(doubts, ("pair", "split"))
+    """Return the number of objects with a position that are likely doubles, or may be several things or at a wrong place.
+
+    Objects that too few frames show do not count, because many of them are no sign of wrong poses or exchanged boxes.
+    """
+    named = doubtful_ids((one for one in doubts if one.reason != apart.RARELY_SEEN), ("pair", "split"))
     return sum(one.id in named for one in result.map.resolved())
 
 
